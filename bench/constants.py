@@ -6,20 +6,18 @@ least ``SHOWN`` and the 95 % interval of the paired differences (Student's t) le
 gain on any promise does not earn its place. A variant runs with all seeds, or until the interval of one promise lies
 wholly beyond ``SHOWN``: what is needed is known then.
 
-``gr-ros2 ablate`` does not run over them: its variants differ in settings, which any user can repeat with ``--set``.
-These are no settings, and no value that is passed in either: each constant stands beside the rule that it tunes, with
-what it was measured by, and 22 variants take away a whole rule, which has no number. So a variant patches modules, in
-worker processes. The rules of the adaptive rate have promises of their own: :mod:`bench.rate_rules`.
+A variant is a :class:`~gr_ros2.core.tuning.Tuning` with another value, passed in; a rule is off where its value says
+so. ``gr-ros2 ablate`` does not run over them: its variants differ in settings, which any user can repeat with
+``--set``. What serves the first hellos, shared channels and relaying has no promise here (``bench first``,
+``reliable``, ``relay``), and the adaptive rate has its own: :mod:`bench.rate_rules`.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
-from importlib import import_module
 from itertools import repeat
 from math import exp, inf, isfinite, log, sqrt
 from statistics import mean, stdev
@@ -27,7 +25,7 @@ from typing import Any
 
 from bench import repair, repair_backlog, saturated, uneven
 from bench.rows import Row
-from gr_ros2.link.v1.reports import Reporter
+from gr_ros2.core.tuning import Tuning
 
 SEEDS = range(1, 7)
 SECONDS = 20.0
@@ -37,73 +35,61 @@ SHOWN = 0.03
 _T = {3: 4.303, 4: 3.182, 5: 2.776, 6: 2.571}
 """97.5 % quantile of Student's t, by the number of seeds."""
 
-Patch = tuple[str, str, Any]
-"""Module of ``gr_ros2.link.v1``; name in it (a dot leads into a class), and its value."""
-
-
-def _module(name: str) -> Any:
-    return import_module(f"gr_ros2.link.v1.{name}")
-
-
-def _scaled(module: str, name: str, *factors: float) -> Iterator[tuple[str, list[Patch]]]:
-    value = getattr(_module(module), name)
-    for factor in factors or (0.5, 2.0):
-        new = type(value)(value * factor)
-        yield f"{name} = {new:.4g}, not {value:.4g}", [(module, name, new)]
-
-
-def _newest_only(make: Callable[[Any, float], Any]) -> Callable[[Any, float], Any]:
-    """Reports of the newest packets only."""
-
-    def made(reporter: Any, now: float) -> Any:
-        reporter._old_turn = True
-        return make(reporter, now)
-
-    return made
-
-
-def _nothing(*_: Any) -> None:
-    pass
-
-
-RULES: dict[str, list[Patch]] = {
-    "no waiting for a message that is due": [("hold", "Hold.until", lambda _self, now, _end, _airtime, **_: now)],
-    "waiting also where repairs are owed": [("hold", "_MOST_OWED", 0.0)],
-    "waiting also where it gained nothing": [("hold", "_MOST_IN_VAIN", 0)],
-    "waiting for any gain": [("hold", "_GAIN", 0.0)],
-    "waiting for the shortest overlap": [("hold", "OVERLAP", 0.0)],
-    "no early reports": [("peers", "PROMPT", 2.0), ("reports", "PROMPT", 2.0)],
-    "no rarer reports": [("reports", "CALM", 0.0)],
-    "no reports again while messages wait": [("reports", "_AGAIN_S", inf)],
-    "no reports of the oldest missing packets": [("reports", "Reporter.make", _newest_only(Reporter.make))],
-    "no resending before new packets": [("repair", "RepairWindow.urgent", lambda _self, _now: None)],
-    "no word before new packets that a packet is over": [("repair_slots", "PATIENCE_S", inf)],
-    "no repairs before new packets one way": [("unreported", "Unreported.due", lambda _self, _newest: False)],
-    "no end of repairs one way": [("unreported", "Unreported.cover", _nothing)],
-    "no account of repairs under way": [("thrift", "Thrift.combined", _nothing)],
-    "repairs for any expected loss": [("thrift", "_ENOUGH", 0.0)],
-    "only the newest delay of a report": [("peers", "_DELAYS", 1)],
-    "late reports waited for too": [("peers", "_SOON", inf)],
-    "windows of repairs that do not move": [("combining", "_GOLDEN", 0.0)],
-    "gaps waited for where few come back": [("order", "_SMOOTHING", 0.0)],
-    "no knowledge of what gaps held": [("gap_contents", "GapContents.learn", _nothing)],
-    "no turns of topics": [("freshness", "TURN", 1 << 30)],
-    "long messages by value alone": [("packing", "LONG", 1 << 30)],
+RULES: dict[str, dict[str, Any]] = {
+    "no waiting for a message that is due": {"hold_overlap": inf},
+    "waiting also where repairs are owed": {"hold_most_owed": 0.0},
+    "waiting also where it gained nothing": {"hold_most_in_vain": 0},
+    "waiting for any gain": {"hold_gain": 0.0},
+    "waiting for the shortest overlap": {"hold_overlap": 0.0},
+    "no early reports": {"report_prompt_loss": 2.0},
+    "no rarer reports": {"report_calm_loss": 0.0},
+    "no reports again while messages wait": {"report_again_s": inf},
+    "no reports of the oldest missing packets": {"report_oldest": 1 << 30},
+    "no repairs before new packets": {"repair_most_ahead": 0},
+    "no word before new packets that a packet is over": {"repair_patience_s": inf},
+    "no repairs before new packets one way": {"unreported_owed": inf},
+    "no end of repairs one way": {"unreported_enough": inf},
+    "no account of repairs under way": {"repair_under_way": 0.0},
+    "repairs for any expected loss": {"repair_enough": 0.0},
+    "only the newest delay of a report": {"peer_delays": 1},
+    "late reports waited for too": {"peer_soon": inf},
+    "windows of repairs that do not move": {"window_step": 0.0},
+    "gaps waited for where few come back": {"order_smoothing": 0.0},
+    "no knowledge of what gaps held": {"gap_packets": 0},
+    "no turns of topics": {"turn_every": 1 << 30},
+    "long messages by value alone": {"long_packets": 1 << 30},
 }
 CONSTANTS = (
-    ("lifetime", "WORTH"), ("thrift", "_ENOUGH"), ("order", "_SMOOTHING"),
-    ("peers", "_DELAYS"), ("peers", "_SOON"), ("peers", "PROMPT"), ("freshness", "TURN"),
-    ("packing", "FULL_PART"), ("packing", "LONG"),
-    ("reports", "_EVERY"), ("reports", "_SMOOTHING"), ("reports", "_PAUSE_S"), ("reports", "_CALM_S"),
-    ("reports", "CALM"), ("reports", "_SLOWER"), ("reports", "_AGAIN_S"), ("reports", "PER_ARRIVED"),
-    ("reports", "PER_LOSS"), ("reports", "PER_VAIN"), ("reports", "_MOST"),
-    ("hold", "OVERLAP"), ("hold", "SURPLUS"), ("hold", "_MOST_OWED"), ("hold", "_SMOOTHING"),
-    ("hold", "_LATE"), ("hold", "_MOST_IN_VAIN"), ("hold", "_GAIN"),
-)  # fmt: skip
+    *("turn_every", "fragment_part", "long_packets"),
+    *("repair_enough", "repair_worth", "repair_patience_s", "repair_poll_s", "repair_calm_poll_s", "repair_most_ahead"),
+    *("gap_packets", "order_smoothing"),
+    *(
+        "hold_overlap",
+        "hold_surplus",
+        "hold_most_owed",
+        "hold_smoothing",
+        "hold_late",
+        "hold_most_in_vain",
+        "hold_gain",
+    ),
+    *("unreported_most_loss", "unreported_enough", "unreported_owed"),
+    *("report_every", "report_per_arrived", "report_per_loss", "report_per_vain", "report_most_saved"),
+    *("report_smoothing", "report_pause_s", "report_calm_s", "report_calm_loss", "report_slower", "report_again_s"),
+    *("report_prompt_loss", "report_oldest"),
+    *("peer_delays", "peer_interval_s", "peer_silence", "peer_later", "peer_soon"),
+    *("hello_bytes_s", "hello_often_s", "hello_seldom_s", "hello_early", "kept_starting_s", "table_share"),
+)
 
 
-def _six(seed: int) -> float:
-    topics, _ = saturated.run("six-topics-paced", 0.2, seed=seed, seconds=SECONDS)
+def scaled(tuning: Tuning, name: str) -> dict[str, Tuning]:
+    """With half of a constant, and with twice as much."""
+    value = getattr(tuning, name)
+    news = [type(value)(value * factor) for factor in (0.5, 2.0)]
+    return {f"{name} = {new:.4g}, not {value:.4g}": replace(tuning, **{name: new}) for new in news}
+
+
+def _six(seed: int, tuning: Tuning) -> float:
+    topics, _ = saturated.run("six-topics-paced", 0.2, seed=seed, seconds=SECONDS, tuning=tuning)
     return exp(mean(log(topic.age) for topic in topics))
 
 
@@ -113,24 +99,24 @@ def _paced(name: str, seed: int, *, back: bool, **settings: Any) -> float:
     return exp(mean(log(age) for age in ages.values()))
 
 
-def _uneven(seed: int) -> dict[str, float]:
+def _uneven(seed: int, tuning: Tuning) -> dict[str, float]:
     """Mean waits of messages that do not come evenly."""
     found: dict[str, float] = {}
     for name, messages in (("random", uneven.random_times), ("in pairs", uneven.pairs)):
         found[f"{name}, one way: wait"] = mean(
-            uneven.waits(messages(seed, 40.0, SECONDS), 0.2, 1 / repair.RATE, back=False, seed=seed)
+            uneven.waits(messages(seed, 40.0, SECONDS), 0.2, 1 / repair.RATE, back=False, seed=seed, tuning=tuning)
         )
-    last = uneven.waits(uneven.commands(seed, 0.4, 1000.0), 0.4, 0.4, back=True, seed=seed)
+    last = uneven.waits(uneven.commands(seed, 0.4, 1000.0), 0.4, 0.4, back=True, seed=seed, tuning=tuning)
     return {**found, "commands before silence: wait": mean(last)}
 
 
-def promises(seed: int) -> dict[str, float]:
+def promises(seed: int, tuning: Tuning = Tuning()) -> dict[str, float]:
     """The figures of the docs' promises with one seed; less is better."""
-    repair_backlog.run.cache_clear()
     found: dict[str, float] = {}
+    common: dict[str, Any] = {"seed": seed, "tuning": tuning}
 
     def add(name: str, **settings: Any) -> None:
-        outcome = repair.run(seed=seed, **{"repair": "auto", "seconds": SECONDS, **settings})
+        outcome = repair.run(**{"repair": "auto", "seconds": SECONDS, **common, **settings})
         found[f"{name}: age"], found[f"{name}: p99"] = outcome.age, outcome.p99
         found[f"{name}: packets"] = outcome.packets
         if outcome.reports:
@@ -149,44 +135,24 @@ def promises(seed: int) -> dict[str, float]:
     add("busy, one way", hz=55.0, loss=0.2)
     add("15 packets", hz=3.0, size=700, loss=0.2, back=0.2)
     add("15 packets, one way", hz=3.0, size=700, loss=0.2)
-    large = repair.run(seed=seed, repair="auto", once=True, size=500_000, packet_len=1500, loss=0.2, tail=200)
+    large = repair.run(
+        seed=seed, repair="auto", once=True, size=500_000, packet_len=1500, loss=0.2, tail=200, tuning=tuning
+    )
     found["500 kB, one way: packets"] = large.sent_until
     for reports in (True, False):
-        beside = repair_backlog.run((300_000, 1), 0.2, reports=reports, seed=seed)
+        beside = repair_backlog.run((300_000, 1), 0.2, reports=reports, **common)
         way = "reports" if reports else "one way"
         found[f"beside 300 kB, {way}: age"], found[f"300 kB, {way}: s"] = beside.age, beside.done
-    found["six topics, full"] = _six(seed)
-    found["odometry, full"] = saturated.run("narrow-ofdm-paced", 0.2, seed=seed, seconds=SECONDS)[0][0].age
+    found["six topics, full"] = _six(seed, tuning)
+    found["odometry, full"] = saturated.run("narrow-ofdm-paced", 0.2, seed=seed, seconds=SECONDS, tuning=tuning)[0][
+        0
+    ].age
     for hz in (35, 40, 45):
         for way, back in (("one way", False), ("reports", True)):
-            found[f"paced at {hz} Hz, {way}"] = _paced("paper-ofdm-paced", seed, back=back, odom_rate=hz)
-    found["paced, six topics"] = _paced("six-topics-paced", seed, back=False)
-    found.update(_uneven(seed))
+            found[f"paced at {hz} Hz, {way}"] = _paced("paper-ofdm-paced", seed, back=back, odom_rate=hz, tuning=tuning)
+    found["paced, six topics"] = _paced("six-topics-paced", seed, back=False, tuning=tuning)
+    found.update(_uneven(seed, tuning))
     return found
-
-
-@contextmanager
-def patched(patches: Sequence[Patch]) -> Iterator[None]:
-    """The engine with other constants or without rules, wherever they are imported."""
-    before: list[tuple[Any, str, Any]] = []
-    for module, name, value in patches:
-        place = _module(module)
-        first, _, rest = name.partition(".")
-        if rest:
-            holders = [getattr(place, first)]
-        else:
-            known = getattr(place, name)
-            engine = [m for key, m in list(sys.modules.items()) if key.startswith("gr_ros2.link.v1.")]
-            public = not name.startswith("_") and sum(hasattr(m, name) for m in engine) > 1
-            holders = [m for m in engine if getattr(m, name, None) is known and public] or [place]
-        for holder in holders:
-            before.append((holder, rest or name, getattr(holder, rest or name)))
-            setattr(holder, rest or name, value)
-    try:
-        yield
-    finally:
-        for holder, name, value in reversed(before):
-            setattr(holder, name, value)
 
 
 def variant(name: str, base: Sequence[dict[str, float]]) -> list[dict[str, float]]:
@@ -194,20 +160,22 @@ def variant(name: str, base: Sequence[dict[str, float]]) -> list[dict[str, float
 
     :param base: the promises without it, by seed
     """
-    found: list[dict[str, float]] = []
-    with patched(variants()[name]):
-        for seed in SEEDS:
-            found.append(promises(seed))
-            if len(found) in _T and any(change - half >= SHOWN for change, half in changes(base, found).values()):
-                break
+    tuning, found = variants()[name], list[dict[str, float]]()
+    for seed in SEEDS:
+        found.append(promises(seed, tuning))
+        if len(found) in _T and any(change - half >= SHOWN for change, half in changes(base, found).values()):
+            break
     return found
 
 
 @cache
-def variants() -> dict[str, list[Patch]]:
-    """What is changed, by name."""
-    scaled = [item for module, name in CONSTANTS for item in _scaled(module, name)]
-    return {**RULES, **dict(scaled)}
+def variants() -> dict[str, Tuning]:
+    """What is varied, by name."""
+    usual = Tuning()
+    found = {name: replace(usual, **changed) for name, changed in RULES.items()}
+    for name in CONSTANTS:
+        found |= scaled(usual, name)
+    return found
 
 
 def changes(base: Sequence[dict[str, float]], found: Sequence[dict[str, float]]) -> dict[str, tuple[float, float]]:

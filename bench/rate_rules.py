@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import random
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from math import exp, inf, log, sqrt
 from statistics import mean, stdev
@@ -22,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
+from bench.constants import scaled
 from bench.rows import Row
-from gr_ros2.link import rate as engine
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.reports import Reporter
@@ -72,17 +72,17 @@ class Link:
     off_db: float = 0.0
 
 
-def run(snr: Snr, link: Link, seed: int) -> float:
+def run(snr: Snr, link: Link, seed: int, tuning: Tuning = Tuning()) -> float:
     """s on the air per packet that arrives.
 
     :param snr: SNR in dB at a time in s, of both directions
     """
     draw = random.Random(seed)
-    rate = RateController(MCS_TABLE)
+    rate = RateController(MCS_TABLE, tuning)
     rate.meet(2)
     decoder: Any = SimpleNamespace(newest=-1, bodies=())
     order: Any = SimpleNamespace(wanted=0, told=False, held=0)
-    reporter = Reporter((1, 1), decoder, order, Settings(2, half_duplex=link.half_duplex))
+    reporter = Reporter((1, 1), decoder, order, Settings(2, half_duplex=link.half_duplex, tuning=tuning))
     under_way: deque[tuple[float, float, float]] = deque()
     free = 0.0
 
@@ -173,36 +173,21 @@ CHANNELS: dict[str, tuple[Callable[[int], Snr], Link]] = {
     **{f"{db:g} dB, {kind}": (partial(_constant, db), link) for db in (2.0, 7.0, 11.0) for kind, link in KINDS.items()},
 }
 """The SNR by seed, and the link. A constant SNR has .2 to .8 dB more with other seeds, so that edges are among them."""
-CONSTANTS = (
-    *("GAIN", "LOOK_BACK_S", "ERROR_DB", "CORRECTION_DB_S", "FORGET_S", "GAPS"),
-    *("LEAST_SILENT_S", "MOST_SILENT_S", "UNANSWERED", "SMOOTHING"),
-)
-RULES: dict[str, dict[str, float]] = {
-    "any gain is enough": {"GAIN": 1.0},
-    "no fall since the last report": {"LOOK_BACK_S": inf},
-    "no allowance for errors": {"ERROR_DB": 0.0},
-    "no correction": {"CORRECTION_DB_S": 0.0},
-    "no silence by gaps": {"UNANSWERED": 1 << 30},
-    "silence though nothing was sent": {"UNANSWERED": 0},
-    "no shortest silence": {"LEAST_SILENT_S": 0.0},
+CONSTANTS = tuple(each.name for each in fields(Tuning) if each.name.startswith("rate_"))
+RULES: dict[str, dict[str, Any]] = {
+    "any gain is enough": {"rate_gain": 1.0},
+    "no fall since the last report": {"rate_look_back_s": inf},
+    "no allowance for errors": {"rate_error_db": 0.0},
+    "no correction": {"rate_correction_db_s": 0.0},
+    "no silence by gaps": {"rate_unanswered": 1 << 30},
+    "silence though nothing was sent": {"rate_unanswered": 0},
+    "no shortest silence": {"rate_least_silent_s": 0.0},
 }
 
 
-@contextmanager
-def changed(constants: dict[str, float]) -> Iterator[None]:
-    """The adaptive rate with other constants."""
-    before = {name: getattr(engine, name) for name in constants}
-    vars(engine).update(constants)
-    try:
-        yield
-    finally:
-        vars(engine).update(before)
-
-
-def airtimes(constants: dict[str, float]) -> dict[str, list[float]]:
-    """s on the air per packet that arrives, on each channel with each seed, with other constants."""
-    with changed(constants):
-        return {name: [run(snr(seed), link, seed) for seed in SEEDS] for name, (snr, link) in CHANNELS.items()}
+def airtimes(tuning: Tuning) -> dict[str, list[float]]:
+    """s on the air per packet that arrives, on each channel with each seed."""
+    return {name: [run(snr(seed), link, seed, tuning) for seed in SEEDS] for name, (snr, link) in CHANNELS.items()}
 
 
 def changes(base: dict[str, list[float]], found: dict[str, list[float]]) -> dict[str, float]:
@@ -218,13 +203,12 @@ def changes(base: dict[str, list[float]], found: dict[str, list[float]]) -> dict
 
 def rate_rules() -> list[Row]:
     """One row per rule and constant: the channels that it changes."""
-    variants = dict(RULES)
+    usual = Tuning()
+    variants = {what: replace(usual, **changed) for what, changed in RULES.items()}
     for name in CONSTANTS:
-        value = getattr(engine, name)
-        for new in (value / 2, value * 2):
-            variants[f"{name} = {new:.3g}, not {value:.3g}"] = {name: type(value)(new)}
+        variants |= scaled(usual, name)
     with ProcessPoolExecutor(2) as pool:
-        base, *found = pool.map(airtimes, [{}, *variants.values()])
+        base, *found = pool.map(airtimes, [usual, *variants.values()])
     rows = []
     for what, result in zip(variants, found, strict=True):
         shown = changes(base, result)

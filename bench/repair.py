@@ -17,6 +17,7 @@ from statistics import mean
 from typing import Any, Literal
 
 from bench.rows import Row
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import EndpointV1
@@ -103,6 +104,7 @@ def run(
     options: SendOptions | None = None,
     delay: int = 0,
     outage: float = 0.0,
+    tuning: Tuning = Tuning(),
 ) -> Outcome:
     """One sender and some receivers.
 
@@ -112,10 +114,11 @@ def run(
     :param tail: s after the last message
     :param delay: slots that reports take beside their own
     :param outage: s at the end of each ``OUTAGE_EVERY_S``, in which nothing arrives in either direction
+    :param tuning: of all
     """
     registry = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options or SendOptions())])
     events: list[SenderEvent] = []
-    common = {"packet_len": packet_len}
+    common = {"packet_len": packet_len, "tuning": tuning}
     sender = EndpointV1(
         registry,
         Settings(1, repair=repair, hears=back is not None, **common),  # type: ignore[arg-type]

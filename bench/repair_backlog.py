@@ -13,6 +13,7 @@ from math import inf
 
 from bench.repair import RATE, losses, quantile
 from bench.rows import Row
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import EndpointV1
@@ -48,12 +49,20 @@ class Beside:
 
 
 @lru_cache
-def run(sizes: tuple[int, ...], loss: float, *, odometry: bool = True, reports: bool = True, seed: int = 1) -> Beside:
+def run(
+    sizes: tuple[int, ...],
+    loss: float,
+    *,
+    odometry: bool = True,
+    reports: bool = True,
+    seed: int = 1,
+    tuning: Tuning = Tuning(),
+) -> Beside:
     """One robot that sends to one that reports, or that only listens."""
     options = SendOptions(queue="fifo", reliability="reliable")
     names = Registry([Topic(n, name, "std_msgs/msg/String", options) for n, name in enumerate(("odom", "long"))])
-    sender = EndpointV1(names, Settings(1, packet_len=PACKET_LEN, hears=reports), boot=1000)
-    receiver = EndpointV1(None, Settings(2, packet_len=PACKET_LEN, hears=reports), boot=2000)
+    sender = EndpointV1(names, Settings(1, packet_len=PACKET_LEN, hears=reports, tuning=tuning), boot=1000)
+    receiver = EndpointV1(None, Settings(2, packet_len=PACKET_LEN, hears=reports, tuning=tuning), boot=2000)
     sender.pace.use_credit()
     receiver.pace.use_credit()
     forward, backward = losses(seed * 1000, loss, 1.0), losses(seed * 1000 + 500, loss, 1.0)

@@ -21,6 +21,7 @@ from typing import Any
 
 from bench.repair import losses
 from bench.rows import Row
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered
@@ -139,6 +140,7 @@ def run(
     seconds: float = 38.0,
     seed: int = 1,
     burst: float = 1.0,
+    tuning: Tuning = Tuning(),
 ) -> tuple[list[Topic], Counter[str]]:
     """One scenario over a slotted channel: its topics, and the packets by what they were spent on.
 
@@ -151,7 +153,7 @@ def run(
     serials: dict[tuple[int, bytes], list[int]] = {}
     forward, backward = losses(seed * 1000, loss, burst), losses(seed * 1000 + 500, loss, burst)
     air: Counter[str] = Counter()
-    common = {"packet_len": packet_len, "hears": back, "queue_depth": source.queue_depth}
+    common = {"packet_len": packet_len, "hears": back, "queue_depth": source.queue_depth, "tuning": tuning}
     sender = EndpointV1(case.registry, Settings(1, repair=AUTO, **common), boot=1000)  # type: ignore[arg-type]
     receiver = EndpointV1(None, Settings(2, **common), boot=2000)  # type: ignore[arg-type]
     receiver.pace.use_credit()
@@ -222,6 +224,7 @@ def paced(
     best_effort: Sequence[str],
     duration_s: float | None = None,
     odom_rate: float | None = None,
+    tuning: Tuning = Tuning(),
 ) -> dict[str, float]:
     """Mean age in s of each topic of a scenario in simulated time; of one that delivers nothing, its duration.
 
@@ -239,7 +242,7 @@ def paced(
         settings["robots"] = [{}, {"topics": []}]
     if duration_s is not None:
         settings["duration_s"] = duration_s
-    result = simulate(load_scenario(name, options, **settings))
+    result = simulate(load_scenario(name, options, **settings), tuning=tuning)
     ages = {topic.topic.rsplit("/", 1)[-1]: topic.age_s.mean for topic in result.topics}
     return {topic: result.duration_s if age is None else age for topic, age in ages.items()}
 

@@ -12,6 +12,7 @@ from collections import deque
 from itertools import count
 
 from bench.repair import losses
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, ReceiverEvent
 from gr_ros2.link.v1.endpoint import EndpointV1
@@ -59,15 +60,22 @@ def commands(seed: int, airtime: float, seconds: float) -> list[tuple[float, int
 
 
 def waits(
-    messages: list[tuple[float, int]], loss: float, airtime: float, *, back: bool, seed: int, tail: float = 20.0
+    messages: list[tuple[float, int]],
+    loss: float,
+    airtime: float,
+    *,
+    back: bool,
+    seed: int,
+    tail: float = 20.0,
+    tuning: Tuning = Tuning(),
 ) -> list[float]:
     """s from submission to delivery of each reliable message that arrives.
 
     :param messages: times (s) and topics
     :param back: whether the receiver reports, over a reverse direction of the same loss
     """
-    sender = EndpointV1(_TOPICS, Settings(1, packet_len=64, hears=back), boot=1000)
-    receiver = EndpointV1(None, Settings(2, packet_len=64, hears=back), boot=2000)
+    sender = EndpointV1(_TOPICS, Settings(1, packet_len=64, hears=back, tuning=tuning), boot=1000)
+    receiver = EndpointV1(None, Settings(2, packet_len=64, hears=back, tuning=tuning), boot=2000)
     ways = [
         (sender, receiver, losses(seed * 1000, loss, 1.0)),
         (receiver, sender, losses(seed * 1000 + 500, loss, 1.0)),

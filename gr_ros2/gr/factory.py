@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.gr.starts import state_file
 from gr_ros2.link.air import Air
 from gr_ros2.link.endpoint import OpenEndpoint
@@ -89,13 +90,14 @@ def make_endpoint(
     observer: Callable[[SenderEvent], None] | None = None,
     calls: bool = False,
     loops_back: bool = False,
+    tuning: Tuning = Tuning(),
 ) -> OpenEndpoint:
     """Make one robot's end of a link.
 
     :param registry: the topics that it may send
     :param codec: codec of all messages; None: made here
     :param calls: whether services cross the link: the last topic of the endpoint's registry is for requests and replies
-    :param loops_back: see :func:`end_settings`
+    :param loops_back, tuning: see :func:`end_settings`
     :raises ConfigError: for settings that contradict each other
     """
     if registry.services and not calls:
@@ -111,7 +113,7 @@ def make_endpoint(
     known = message_codec()
     return EndpointV1(
         topics or None,
-        end_settings(robot, air, loops_back=loops_back),
+        end_settings(robot, air, loops_back=loops_back, tuning=tuning),
         boot=start.boot,
         keys=start.keys,
         codec=(codec or message_codec(topics)) if robot.compression and (robot.sends or calls) else None,

@@ -18,33 +18,13 @@ seconds, monotonic.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import exp, inf
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.tuning import Tuning
 
-GAIN = 1.1
-"""How many times the present MCS's goodput another MCS must promise to be taken."""
-LOOK_BACK_S = 0.06
-"""s over which a change of the SNR is measured: long against the errors of single reports."""
-ERROR_DB = 1.0
-"""Change of the SNR within this time that may be an error of measurement, dB."""
-CORRECTION_DB_S = 3.0
-"""dB of correction per s, for a loss of 1 where 0 was expected."""
-FORGET_S = 2.0
-"""s in which the correction falls to 1/e: the SNR is trusted again in the end. With ``CORRECTION_DB_S`` it limits the
-correction to 6 dB."""
-GAPS = 4.0
-"""Usual times between two reports after which a robot counts as silent, if it should have reported."""
-LEAST_SILENT_S = 0.04
-"""s after which a robot counts as silent at the earliest."""
-MOST_SILENT_S = 1.0
-"""s after which no report is trusted."""
-UNANSWERED = 12
-"""Packets to a robot since its last report, from which on it should have reported."""
-SMOOTHING = 0.125
-"""Share of what is new in the averages of the time between reports and of the rate of change."""
 _STEEPEST = 50.0
 """Largest exponent of the odds; beyond it the share that arrives is 0 or 1."""
 
@@ -78,12 +58,13 @@ class Mcs:
 class _Peer:
     """What is known of a receiver."""
 
+    tuning: Tuning
     mcs: int = 0
     reported_db: float = -inf
     """The newest SNR reported."""
     heard: float = -inf
     """When it was reported, s."""
-    gap_s: float = MOST_SILENT_S / GAPS
+    gap_s: float = field(init=False)
     """Usual time between two reports."""
     unanswered: int = 0
     correction_db: float = 0.0
@@ -92,16 +73,25 @@ class _Peer:
     change_db_s: float = 0.0
     """How fast the SNR changes on average, up or down, dB/s: 0 for a constant channel."""
 
+    def __post_init__(self) -> None:
+        self.gap_s = self.longest_gap_s
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Longest time between two reports that counts."""
+        return self.tuning.rate_most_silent_s / self.tuning.rate_gaps
+
     def report(self, snr_db: float, now: float) -> float:
-        """A report came. Returns the s since the one before, at most ``MOST_SILENT_S / GAPS``."""
-        longest = MOST_SILENT_S / GAPS
+        """A report came. Returns the s since the one before, at most ``longest_gap_s``."""
+        tuning, longest = self.tuning, self.longest_gap_s
         gap = min(max(now - self.heard, 0.0), longest)
-        self.gap_s += SMOOTHING * (gap - self.gap_s)
+        self.gap_s += tuning.rate_smoothing * (gap - self.gap_s)
         self.reported_db, self.heard, self.unanswered = snr_db, now, 0
         at, before_db = self.before
-        if now - at >= LOOK_BACK_S:
+        if now - at >= tuning.rate_look_back_s:
             change = abs(snr_db - before_db) if now - at < longest else 0.0
-            self.change_db_s += SMOOTHING * (max(change - ERROR_DB, 0.0) / (now - at) - self.change_db_s)
+            speed = max(change - tuning.rate_error_db, 0.0) / (now - at)
+            self.change_db_s += tuning.rate_smoothing * (speed - self.change_db_s)
             self.before = now, snr_db
         return gap
 
@@ -114,8 +104,10 @@ class _Peer:
     def silent(self, now: float) -> bool:
         """Whether no report has come though it should have."""
         waited = now - self.heard
-        return waited > MOST_SILENT_S or (
-            self.unanswered >= UNANSWERED and waited > max(GAPS * self.gap_s, LEAST_SILENT_S)
+        tuning = self.tuning
+        return waited > tuning.rate_most_silent_s or (
+            self.unanswered >= tuning.rate_unanswered
+            and waited > max(tuning.rate_gaps * self.gap_s, tuning.rate_least_silent_s)
         )
 
 
@@ -126,7 +118,8 @@ class RateController:
     :raises ConfigError: for a table without an MCS, or in another order
     """
 
-    def __init__(self, mcs_table: Sequence[Mcs]) -> None:
+    def __init__(self, mcs_table: Sequence[Mcs], tuning: Tuning) -> None:
+        self._tuning = tuning
         if not mcs_table or any(one.airtime_s <= two.airtime_s for one, two in pairwise(mcs_table)):
             raise ConfigError("the MCS table: one MCS at least, each with less airtime than the one before")
         self.mcs_table = tuple(mcs_table)
@@ -139,15 +132,16 @@ class RateController:
         :param loss: share of the packets that it has lost lately, 0..1
         :param not_for: share of the packets that it should have lost because they were sent faster than it hears
         """
-        known = self._robots.setdefault(robot, _Peer())
+        known = self._robots.setdefault(robot, _Peer(self._tuning))
         gap = known.report(snr_db, now)
         surplus = loss - not_for - (1 - not_for) * (1 - self.mcs_table[known.mcs].pdr(known.snr_db(now)))
-        known.correction_db += gap * (CORRECTION_DB_S * surplus - known.correction_db / FORGET_S)
+        grows = self._tuning.rate_correction_db_s * surplus - known.correction_db / self._tuning.rate_forget_s
+        known.correction_db += gap * grows
         self._choose(known, now, faster=True)
 
     def meet(self, robot: int) -> None:
         """A robot that can report is known. It counts for packets to everybody from now on."""
-        self._robots[robot] = _Peer()
+        self._robots[robot] = _Peer(self._tuning)
 
     def forget(self, robot: int) -> None:
         """A robot is gone."""
@@ -159,14 +153,18 @@ class RateController:
 
     def lost(self, robot: int, mcs: int, now: float) -> float:
         """Share of the packets of an MCS that a robot is expected to lose."""
-        return 1 - self.mcs_table[mcs].pdr(self._robots.get(robot, _Peer()).snr_db(now))
+        return 1 - self.mcs_table[mcs].pdr(self._known(robot).snr_db(now))
 
     def sent(self, robots: Collection[int] | None, now: float) -> int:
         """A packet leaves for some robots, or for everybody (None). Returns the index of its MCS."""
-        known = self._robots.values() if robots is None else [self._robots.get(robot, _Peer()) for robot in robots]
+        known = self._robots.values() if robots is None else [self._known(robot) for robot in robots]
         for one in known:
             one.unanswered += 1
         return min((self._next(one, now) for one in known), default=0)
+
+    def _known(self, robot: int) -> _Peer:
+        """What is known of a robot, nothing before it is met."""
+        return self._robots.get(robot) or _Peer(self._tuning)
 
     def _next(self, known: _Peer, now: float) -> int:
         if known.silent(now):
@@ -183,5 +181,5 @@ class RateController:
         snr_db = known.snr_db(now)
         worth = [mcs.goodput(snr_db) for mcs in (self.mcs_table if faster else self.mcs_table[: known.mcs + 1])]
         best = max(range(len(worth)), key=worth.__getitem__)
-        if worth[best] > GAIN * worth[known.mcs]:
+        if worth[best] > self._tuning.rate_gain * worth[known.mcs]:
             known.mcs = best

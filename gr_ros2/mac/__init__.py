@@ -8,6 +8,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.access import Access
 from gr_ros2.mac.aloha import Aloha
 from gr_ros2.mac.slots import Slots
@@ -20,7 +21,13 @@ GUARD_S = 0.001
 
 
 def access_of(
-    medium: str, airtime_s: float, seed: int, *, guard_s: float = GUARD_S, lead_s: float = 0.0
+    medium: str,
+    airtime_s: float,
+    seed: int,
+    *,
+    guard_s: float = GUARD_S,
+    lead_s: float = 0.0,
+    tuning: Tuning = Tuning(),
 ) -> Callable[[int], Access | None]:
     """What makes the engine of a robot from its id.
 
@@ -33,7 +40,9 @@ def access_of(
     def make(src_id: int) -> Access | None:
         rng = random.Random(f"access {seed} {src_id}")
         if medium == "slots":
-            return Slots(src_id, airtime_s + guard_s, rng, period_s=0.0, lead_s=lead_s)
-        return Aloha(src_id, airtime_s, rng, period_s=0.0, lead_s=lead_s) if medium == "aloha" else None
+            return Slots(src_id, airtime_s + guard_s, rng, period_s=0.0, lead_s=lead_s, tuning=tuning)
+        if medium == "aloha":
+            return Aloha(src_id, airtime_s, rng, period_s=0.0, lead_s=lead_s, tuning=tuning)
+        return None
 
     return make

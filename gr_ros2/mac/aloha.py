@@ -11,16 +11,8 @@ from __future__ import annotations
 import math
 import random
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.wire.mac_block import Block
-
-LOAD = 0.5
-"""Packets that all robots together start in one airtime."""
-HEARD = 1500
-"""Airtimes for which a robot counts: of 100 robots each is heard about every 600."""
-STEP = 0.25
-"""Logarithm of the factor by which the interval grows for each robot in whose place nothing is heard."""
-LONGEST = 300
-"""Airtimes, mean interval of a robot that hears nobody."""
 
 
 class Aloha:
@@ -32,8 +24,16 @@ class Aloha:
     """
 
     def __init__(
-        self, src_id: int, airtime_s: float, rng: random.Random, *, period_s: float, lead_s: float = 0.0
+        self,
+        src_id: int,
+        airtime_s: float,
+        rng: random.Random,
+        *,
+        period_s: float,
+        lead_s: float = 0.0,
+        tuning: Tuning = Tuning(),
     ) -> None:
+        self._tuning = tuning
         self.src_id, self.lead_s = src_id, lead_s
         self._airtime, self._period, self._rng = airtime_s, period_s, rng
         self._heard: dict[int, float] = {}
@@ -51,10 +51,12 @@ class Aloha:
 
     def departure(self, now: float) -> float:
         if self._next is None:
-            robots = sum(at > now - HEARD * self._airtime for at in self._heard.values())
-            missing = math.exp(-2 * LOAD) - self._packets / robots if robots else 1.0
-            least = max(self._period, self._airtime * (1 + robots) / LOAD)
-            self._every = min(max(least, self._every * math.exp(STEP * missing)), max(LONGEST * self._airtime, least))
+            tuning, airtime = self._tuning, self._airtime
+            robots = sum(at > now - tuning.aloha_heard * airtime for at in self._heard.values())
+            missing = math.exp(-2 * tuning.aloha_load) - self._packets / robots if robots else 1.0
+            least = max(self._period, airtime * (1 + robots) / tuning.aloha_load)
+            longer = max(least, self._every * math.exp(tuning.aloha_step * missing))
+            self._every = min(longer, max(tuning.aloha_longest * airtime, least))
             self._packets = 0
             self._next = now + self.lead_s + max(self._airtime, self._rng.expovariate(1 / self._every))
         return self._next

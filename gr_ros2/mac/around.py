@@ -6,13 +6,8 @@ forgotten when the caller says so.
 
 from __future__ import annotations
 
-HEARD = 210
-"""Slots for which a robot that was heard counts as heard; more where robots send less than three times in them."""
-LATELY = 70
-"""Slots within which somebody who is there has sent; more where there are many robots."""
-DEAF = 3
-"""Maps in a row of a neighbour that lack this robot, after which it may be in step with another one. With 1 a lost
-packet is enough: a fourth of the picks in a grid of 5 × 4 at 10 % loss are at random, which leaves slots empty."""
+from gr_ros2.core.tuning import Tuning
+
 NEVER = -1 << 40
 
 
@@ -34,7 +29,8 @@ class SlotOwner:
         self.named = NEVER
         """The slot in which this robot has last named it."""
         self.deaf = 0
-        """Maps in a row that lack the next slot of this robot; ``DEAF`` if a packet without a map does not name it."""
+        """Maps in a row that lack the next slot of this robot; ``slots_deaf`` if a packet without a map does not name
+        it."""
 
 
 class Around:
@@ -46,7 +42,8 @@ class Around:
     :ivar heard_since: the slot since which somebody has been heard
     """
 
-    def __init__(self) -> None:
+    def __init__(self, tuning: Tuning) -> None:
+        self._tuning = tuning
         self.robots: dict[int, SlotOwner] = {}
         self.elsewhere: dict[int, float] = {}
         self.heard_at = self.heard_since = NEVER
@@ -54,12 +51,12 @@ class Around:
     @property
     def memory(self) -> int:
         """Slots for which a robot that was heard counts as heard."""
-        return max(HEARD, 4 * len(self.robots))
+        return max(self._tuning.slots_heard, 4 * len(self.robots))
 
     @property
     def lately(self) -> int:
         """Slots within which somebody who is there has sent."""
-        return max(LATELY, 3 * len(self.robots))
+        return max(self._tuning.slots_lately, 3 * len(self.robots))
 
     def nobody(self, slot: int) -> bool:
         """Whether nobody was heard lately."""
@@ -68,7 +65,7 @@ class Around:
     def deaf(self, slot: int) -> bool:
         """Whether a neighbour has not expected this robot in its next slot for a while."""
         oldest = slot - self.lately
-        return any(robot.last >= oldest and robot.deaf >= DEAF for robot in self.robots.values())
+        return any(robot.last >= oldest and robot.deaf >= self._tuning.slots_deaf for robot in self.robots.values())
 
     def present(self, slot: int) -> list[SlotOwner]:
         """The robots that count as heard."""

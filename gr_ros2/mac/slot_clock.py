@@ -1,20 +1,20 @@
 """Where the slots lie on a robot's own clock. There is no master: the robots follow the packets that they hear.
 
 Each packet names the number of its slot mod 256 and begins when this slot begins. A packet that differs from what this
-clock expects by less than ``TOLERANCE`` moves it by ``GAIN`` of the difference, so clocks of ±50 ppm stay together. A
-greater difference means that the other robot belongs to another group, or that a clock has jumped:
+clock expects by less than ``clock_tolerance`` moves it by ``clock_gain`` of the difference, so clocks of ±50 ppm stay
+together. A greater difference means that the other robot belongs to another group, or that a clock has jumped:
 
 - *Nobody can have followed this clock yet*: move.
 - *Nobody is heard in these slots, and the other robot hears somebody in its own*: move.
 - *A robot that did not agree before is ahead* (numbers are compared as on a circle): move to its slots, so that one of
   two groups moves and the other stays.
 - *Two robots that agreed before differ by the same, and nobody has agreed since*: this clock has jumped. Move.
-- *A robot that agreed before is ahead*: its clock has jumped. Move if it has not noticed after ``PATIENCE``.
-- *A robot is behind*: if it still is after ``BEHIND``, it does not hear this robot. A group whose slots are all in
-  use hears nobody whose packets begin between two of them. Move there, and stay for ``STAYS``: told in its own slots
-  that there are more robots, the group leaves room, and then hears the one that is ahead. Sooner, or more often, robots
-  of a large network move back as fast as others move on. Where nobody agrees there is no group to keep, and
-  ``PATIENCE`` is enough.
+- *A robot that agreed before is ahead*: its clock has jumped. Move if it has not noticed after ``clock_patience``.
+- *A robot is behind*: if it still is after ``clock_behind``, it does not hear this robot. A group whose slots are all
+  in use hears nobody whose packets begin between two of them. Move there, and stay for ``clock_stays``: told in its own
+  slots that there are more robots, the group leaves room, and then hears the one that is ahead. Sooner, or more often,
+  robots of a large network move back as fast as others move on. Where nobody agrees there is no group to keep, and
+  ``clock_patience`` is enough.
 
 Invariants: all times are those of the caller's clock; a robot that is heard can move this clock only as above; the work
 for a packet is bounded by the number of robots heard.
@@ -24,24 +24,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.wire.mac_block import SLOT_NUMBERS
-
-GAIN = 0.2
-"""Share of a difference by which the clock follows. 1 would pass on the jitter of each packet."""
-FIRST_GAIN = 0.5
-"""The same while nobody agrees. Two robots that began apart by a fifth of a slot, and move towards each other, agree
-after one packet of each; by ``GAIN`` their packets overlap at the edges for some more, where they use slots in turn."""
-TOLERANCE = 0.25
-"""Slots. Sender and receiver still agree on the number of a slot, whatever the jitter within the guard."""
-PATIENCE = 105
-"""Slots for which a robot whose clock has jumped may take to notice: some packets of two others."""
-MEMORY = 210
-"""Slots for which a robot that agreed counts as one that agrees."""
-BEHIND = 280
-"""Slots that one that is behind may take to follow."""
-STAYS = 140
-"""Slots. Clearly less than ``BEHIND``: with 210 for both, the two robots of a link between two groups may change sides
-in turn for 4,000 slots (20 at random, held together by one link, are .3 s older at 14 ms a slot)."""
 
 
 class _Odd(NamedTuple):
@@ -58,8 +42,8 @@ class SlotClock:
     :ivar jumps: how often this clock has moved to other slots
     """
 
-    def __init__(self, slot_s: float) -> None:
-        self.slot_s = slot_s
+    def __init__(self, slot_s: float, tuning: Tuning) -> None:
+        self.slot_s, self._tuning = slot_s, tuning
         self.jumps = 0
         self._zero: float | None = None
         self._doubtful = False
@@ -113,11 +97,12 @@ class SlotClock:
         exact = (began - self._zero) / self.slot_s
         error = (exact - number + SLOT_NUMBERS / 2) % SLOT_NUMBERS - SLOT_NUMBERS / 2
         slot = round(exact - error)
-        if -TOLERANCE <= error <= TOLERANCE:
+        if -self._tuning.clock_tolerance <= error <= self._tuning.clock_tolerance:
             agreeing, guessed = self.agreeing(began), self._doubtful or self._unsaid
             self._doubtful = self._doubtful and not checked
             if trusted or (checked and not agreeing):
-                self._zero += (1 if guessed else GAIN if agreeing else FIRST_GAIN) * error * self.slot_s
+                share = self._tuning.clock_gain if agreeing else self._tuning.clock_first_gain
+                self._zero += (1 if guessed else share) * error * self.slot_s
                 self._unsaid = False
             if trusted:
                 self._agreed[src_id] = self._agreed_at = began
@@ -129,7 +114,7 @@ class SlotClock:
         if not (doubtful or joins) and not self._moves(src_id, error, began, trusted=trusted):
             return None
         if error > 0 and not (doubtful or joins):
-            self._stays_until = began + STAYS * self.slot_s
+            self._stays_until = began + self._tuning.clock_stays * self.slot_s
         self._zero += error * self.slot_s
         self.jumps += 1
         self._agreed = {src_id: began} if trusted else {}
@@ -140,22 +125,22 @@ class SlotClock:
 
     def agreeing(self, now: float) -> bool:
         """Whether a robot that is trusted has been heard lately, and agrees."""
-        return now - self._agreed_at < MEMORY * self.slot_s
+        return now - self._agreed_at < self._tuning.clock_memory * self.slot_s
 
     def _moves(self, src_id: int, error: float, now: float, *, trusted: bool) -> bool:
         """Whether to move to the slots of a robot that differs by ``error`` slots: below 0 if it is ahead."""
         if not trusted:
             return not self.agreeing(now) and error < 0
-        memory_s = MEMORY * self.slot_s
+        memory_s = self._tuning.clock_memory * self.slot_s
         odd = self._odd.get(src_id)
-        if odd is None or now - odd.since > 2 * memory_s or abs(odd.error - error) > 2 * TOLERANCE:
+        if odd is None or now - odd.since > 2 * memory_s or abs(odd.error - error) > 2 * self._tuning.clock_tolerance:
             odd = self._odd[src_id] = _Odd(error, now)
         if error < 0 and now - self._agreed.get(src_id, float("-inf")) >= memory_s:
             return True
         alike = [
             other
             for other, (by, since) in self._odd.items()
-            if abs(by - error) <= TOLERANCE and since > self._agreed_at and other in self._agreed
+            if abs(by - error) <= self._tuning.clock_tolerance and since > self._agreed_at and other in self._agreed
         ]
-        patience = BEHIND if error > 0 and self.agreeing(now) else PATIENCE
+        patience = self._tuning.clock_behind if error > 0 and self.agreeing(now) else self._tuning.clock_patience
         return len(alike) > 1 or now - odd.since > patience * self.slot_s

@@ -10,8 +10,8 @@ one for each newcomer: where some come, more are to be expected, and they need f
 of the messages.
 
 *Video.* A robot whose frames (``link.frames``) fill whatever others leave takes more packets than its weight, one more
-or less at a time and at random, as long as all that robots take so makes the frame longer by ``FILLED`` at most. Where
-there is no room for more, who takes most gives one back to who takes less.
+or less at a time and at random, as long as all that robots take so makes the frame longer by ``slots_filled`` at most.
+Where there is no room for more, who takes most gives one back to who takes less.
 
 *Choice.* The first free slot after an equal part of the frame. Slots go on from frame to frame, so one counts as free
 only if nobody else is known to send in the slot one frame before (without this 6 instead of 2 % of the receptions in a
@@ -41,7 +41,8 @@ import math
 import random
 from collections import deque
 
-from gr_ros2.mac.around import DEAF, HEARD, NEVER, Around, SlotOwner
+from gr_ros2.core.tuning import Tuning
+from gr_ros2.mac.around import NEVER, Around, SlotOwner
 from gr_ros2.mac.calendar import Calendar
 from gr_ros2.mac.slot_clock import SlotClock
 from gr_ros2.wire.mac_block import (
@@ -55,44 +56,6 @@ from gr_ros2.wire.mac_block import (
     write_block,
 )
 
-LISTEN, QUIET, FRAMES = 24, 4, 2
-"""Slots for which a robot listens before it enters: two frames of those it hears, since each has announced its slots
-in one, but ``LISTEN`` at most; ``QUIET`` at least, and where nobody is heard. With a ``LISTEN`` of 12, one of 20 whose
-clock has jumped by 1 s may collide with others 5 s later; with a ``QUIET`` of 24, two robots hear each other after 31
-slots instead of 15 (median), 50 from cold after 521 instead of 548. With 3, it is the same as with 4."""
-FILLED = 0.5
-"""Part by which the frame may be longer for video: no robot's turn comes 1.5 times as late as without it."""
-CHOICE = 4
-"""Free slots among which a robot picks at random where it does so."""
-MIXED = 0.02
-"""Share of picks at random where nothing calls for it: of two neighbours in step each may be heard by all others."""
-NAMED = 2.2
-"""Frames for which a robot that was heard is named: one packet of it may be lost."""
-UNSURE = 1.75
-"""Frames without being named, of which each has two names for each robot, after which a robot may be in step with
-another one."""
-KNOWN_LATE = 9
-"""Slots that this is at least: a host knows a packet some slots after it began, and composes its own ahead. Without it
-two links on one computer (6 ms a slot) picked at random half of the time, and sent 27 instead of 41 packets/s each."""
-NEWCOMER, NEWCOMER_FRAMES = 140, 8
-"""Slots for which a robot is a newcomer; in a small cell so many frames, as they are without newcomers. Without slots
-for them, 50 robots need 18 s instead of 9 to get in from cold at 14 ms a slot, and a robot between two full cells may
-be heard by nobody for a minute. 70 slots take two seconds longer, 210 no less."""
-LATE_S, LATE = 0.01, 1 / 16
-"""s by which a host may be late at most for a packet to be sent all the same, and a slot; and the same in slots, where
-these are long: what composes far ahead has room for it. With ``LATE_S`` alone, two hosts that are up to 30 ms late lose
-slots of .78 s that they have announced, and each has a message of the other after 15.6 s instead of 9.8 (median)."""
-EASED = 0.97
-"""What v is multiplied by in a free slot."""
-VAIN = 4
-"""What v is multiplied by after an entry in vain. With 2, v stays near 2 while 50 robots enter from cold, most entries
-collide, and it takes 10 instead of 7.5 s on average; with 3 to 8 it is the same."""
-_FIRST_RATE, _NAMED_RATE, _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 4.0, 2.0, 4.0, 64.0, 64.0
-"""v at the start; of one that is named, and has no slots; after an entry (with 8 a grid of 5 × 4 is 3 % older); and the
-most that entries in vain make. For one that is named: with 4, the first message of two robots with a key comes after
-15.7 s where packets take half a second (``python -m bench first``); with 1, the ends of a line of three, which do not
-hear each other, begin at once, and one that comes back gets a message too late for a deadline of 4 s in 4 of 14 starts,
-as in one with 2. At the start it is the same with 3 or 2."""
 _SWEEP = 64
 _SILENT = 4096
 """Slots after which a robot that does not send forgets what has passed."""
@@ -110,13 +73,23 @@ class Slots:
     :ivar reserved: whether the block before had announced the slot of the newest one
     """
 
-    def __init__(self, src_id: int, slot_s: float, rng: random.Random, *, period_s: float, lead_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        src_id: int,
+        slot_s: float,
+        rng: random.Random,
+        *,
+        period_s: float,
+        lead_s: float = 0.0,
+        tuning: Tuning = Tuning(),
+    ) -> None:
+        self._tuning = tuning
         self.src_id, self.lead_s = src_id, lead_s
         self._ahead = math.ceil(lead_s / slot_s)
         """Whole slots by which packets are composed ahead."""
         self._every = 3.0
         """Slots from one packet of this robot to the next, in the mean."""
-        self.clock = SlotClock(slot_s)
+        self.clock = SlotClock(slot_s, tuning)
         self.reserved = False
         self._weight = 1
         self._filling = 0
@@ -130,14 +103,14 @@ class Slots:
         self._said: deque[tuple[int, tuple[int, ...]]] = deque(maxlen=1 + self._ahead)
         """The slots of the newest packets, and what they announced."""
         self.calendar = Calendar()
-        self.around = Around()
+        self.around = Around(tuning)
         self._named_at = self._confirmed_at = NEVER
         """Slots: a neighbour last named another robot; this robot."""
         self._swept = NEVER
         """The slot at which what had passed was forgotten."""
         self._entered_at: int | None = None
         """The slot of the first send since the entry; None outside."""
-        self._rate = _FIRST_RATE
+        self._rate = self._tuning.slots_first_rate
         """v; see the module."""
         self._since: float | None = None
 
@@ -146,7 +119,7 @@ class Slots:
         if not self.clock.runs:
             return False
         slot = self.clock.slot(now)
-        named = self._confirmed_at + 2 * self.around.memory, self.around.heard_since + 3 * HEARD
+        named = self._confirmed_at + 2 * self.around.memory, self.around.heard_since + 3 * self._tuning.slots_heard
         return not self.around.nobody(slot) and max(named) < slot
 
     # ---- sending
@@ -170,7 +143,8 @@ class Slots:
             self.clock.start(ready)
         while self._mine:
             begin = self.clock.begin(self._mine[0])
-            if begin >= ready - max(min(self.clock.slot_s, LATE_S), LATE * self.clock.slot_s):
+            slot_s, tuning = self.clock.slot_s, self._tuning
+            if begin >= ready - max(min(slot_s, tuning.slots_late_s), tuning.slots_late * slot_s):
                 return begin
             self._mine.pop(0)
         self._mine.append(self._entry(self.clock.slot(max(ready, self._listened)) + 1))
@@ -181,7 +155,9 @@ class Slots:
         """s, when it has listened for long enough."""
         assert self._since is not None
         frame = max(self.around.loads(NEVER, self._weight)) + 2 if self.around.robots else 0
-        return self._since + min(max(FRAMES * frame, QUIET), LISTEN) * self.clock.slot_s
+        tuning = self._tuning
+        slots = min(max(tuning.slots_listen_frames * frame, tuning.slots_quiet), tuning.slots_listen)
+        return self._since + slots * self.clock.slot_s
 
     def block(self, weight: int = 1, *, fills: bool = False) -> bytes | None:
         if not self._mine:  # asked ahead of the end of its silence: nobody is there whose slots it could take
@@ -198,11 +174,11 @@ class Slots:
             self.clock.said()
         elif not alone and self._unwelcome(now):
             self._leave()
-            self._rate = min(VAIN * self._rate, _LEAST_RATE)
+            self._rate = min(self._tuning.slots_vain * self._rate, self._tuning.slots_most_rate)
             return None
         self.reserved = slot in self._announced
         if alone:
-            self._rate = min(2 * self._rate, _DEAF_RATE)
+            self._rate = min(2 * self._rate, self._tuning.slots_deaf_rate)
         self._filling = self._filled(now) if fills else 0
         self._weight = min(weight + self._filling, MOST_WEIGHT)
         loads = self.around.loads(now, self._weight)
@@ -223,7 +199,7 @@ class Slots:
     def _filled(self, now: int) -> int:
         """Packets beyond its weight that this robot sends in a frame, for video."""
         others = [robot.weight - 1 for robot in self.around.present(now)]
-        mine, taken, most = self._filling, sum(others), int(FILLED * (len(others) + 2))
+        mine, taken, most = self._filling, sum(others), int(self._tuning.slots_filled * (len(others) + 2))
         if not others:
             return 0
         if mine + taken > most and mine >= max(others):
@@ -250,7 +226,7 @@ class Slots:
             if self.calendar.free(slot):
                 if self._rng.random() < 1 / self._rate:
                     return slot
-                self._rate = max(1.0, self._rate * EASED)
+                self._rate = max(1.0, self._rate * self._tuning.slots_eased)
         return first + LONGEST_AHEAD
 
     def _pick(self, base: int, now: int, frame: int) -> int:
@@ -262,9 +238,9 @@ class Slots:
         ahead = announceable(step)
         places: list[int] = []
         free = self.calendar.free
-        unnamed = self._confirmed_at < now - max(UNSURE * frame, KNOWN_LATE)
+        unnamed = self._confirmed_at < now - max(self._tuning.slots_unsure * frame, self._tuning.slots_known_late)
         unsure = alone or unnamed or self.around.deaf(now) or self.around.elsewhere
-        wanted = CHOICE if unsure or self._rng.random() < MIXED else 1
+        wanted = self._tuning.slots_choice if unsure or self._rng.random() < self._tuning.slots_mixed else 1
         while ahead <= LONGEST_AHEAD and len(places) < wanted:
             at, before = base + ahead, base + ahead - frame
             followed = before <= now or before == base or free(before)
@@ -281,13 +257,14 @@ class Slots:
         newcomer in the slot that is free in any case, two of nine lines of four robots carry nothing over two hops in
         their first 8 s."""
         known = max(loads) + 1
-        oldest = now - min(NEWCOMER, NEWCOMER_FRAMES * known)
+        oldest = now - min(self._tuning.slots_newcomer, self._tuning.slots_newcomer_frames * known)
         return max(math.ceil(self._period - 1e-9), known + self.around.newcomers(oldest))
 
     def _content(self, slot: int, frame: int, loads: list[int]) -> Block:
         now = slot - self._ahead
         oldest = now - self.around.memory
-        names = self.around.unnamed(max(oldest, now - max(NAMED * frame, KNOWN_LATE)))
+        lately = max(self._tuning.slots_named * frame, self._tuning.slots_known_late)
+        names = self.around.unnamed(max(oldest, now - lately))
         for _, robot in names:
             robot.named = self._turn(slot) if robot.named == NEVER else slot
         first, second = [*(name for name, _ in names), NOBODY, NOBODY][:2]
@@ -339,7 +316,7 @@ class Slots:
                 self._claim(at, src_id)
         self._named(block.names, slot)
         if block.expected is None:
-            robot.deaf = 0 if self.src_id in block.names else DEAF
+            robot.deaf = 0 if self.src_id in block.names else self._tuning.slots_deaf
         else:
             self._mapped(robot, block.expected, block.conflict)
 
@@ -363,7 +340,7 @@ class Slots:
         """Somebody is heard: who was alone lets itself be heard soon."""
         if self._entered_at is not None and self.around.nobody(slot):
             self._leave()
-            self._rate = min(self._rate, _ENTRY_RATE)
+            self._rate = min(self._rate, self._tuning.slots_entry_rate)
 
     def _placed(
         self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool, joins: bool
@@ -395,7 +372,9 @@ class Slots:
             other = self.around.robots.get(name)
             if name == self.src_id:
                 self._confirmed_at = max(self._confirmed_at, slot)
-                self._rate = _NAMED_RATE if self._entered_at is None else _ENTRY_RATE
+                self._rate = (
+                    self._tuning.slots_named_rate if self._entered_at is None else self._tuning.slots_entry_rate
+                )
             elif other is not None and other.named == NEVER:
                 other.named = self._turn(slot)  # one confirmation is enough
             elif name != NOBODY:
@@ -419,4 +398,4 @@ class Slots:
         self.around.part(began)
         self.calendar.clear(slot)
         self._confirmed_at = self._named_at = self._swept = NEVER
-        self._rate = _ENTRY_RATE
+        self._rate = self._tuning.slots_entry_rate

@@ -10,7 +10,7 @@ robot that is heard, and each stream, an engine keeps the newest number that thi
 
 The gain of sending a stream's newest message is the sum over the neighbours of how much younger it makes them, in s.
 With the sum of the squares of all gains over the largest square, how many messages are worth as much as the best one is
-known. Each beyond ``EVEN`` adds 1 to the robot's *weight*, by which it shares the channel with others.
+known. Each beyond ``gain_even`` adds 1 to the robot's *weight*, by which it shares the channel with others.
 
 Invariants: sans-IO, the caller passes in times; the work for a message heard is bounded by the robots heard, and that
 for a choice by robots times streams; equal calls give equal choices; memory is bounded by the ids and the streams that
@@ -24,35 +24,16 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import NamedTuple
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.relay.robots import OtherRobots
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import MOST_WEIGHT
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
-OWN, OTHERS = 0.7, 0.9
-"""Share of the way from what a neighbour was taken to have to a message that it should have heard just now."""
-LIKELY = 0.5
-"""Messages by which all neighbours together are taken to be behind, from which on one is likely to lack the newest."""
-UNKNOWN_S = 10.0
-"""By how much younger a stream's first message is taken to make a robot."""
-KNOWN_S = 1.0
-"""By how much younger a table makes a robot at most that knows it: it tells only that its robot is still there. Without
-this, tables that are sent again starved those that a robot lacks, for ever where there is no room for all."""
-FIRST_PERIOD_S = 0.1
-"""s from one number of a stream to the next, before two are known."""
-ARRIVALS = 16
-"""Numbers of a stream from whose times its period follows."""
-TOLD = 2
-"""Streams of which a packet tells the newest number."""
 EXPIRES_S = 60.0
 """s for which a number refuses lower ones: what was made later than that after it came is newer, or the number was
 false. A message may be much younger than its age says, but it was made before it came; and as much older as packets can
 be held back by who has no key."""
-EVEN = 4
-"""Robots of a line or a grid have up to 4 messages of equal worth, one that joins two groups 6. Among robots that all
-have much to relay, weights gain nothing and take the slots out of their order."""
-SMOOTHING = 0.1
-"""Share by which this number follows from one choice to the next."""
 _HALF = 1 << 15
 
 
@@ -72,11 +53,11 @@ class _State:
 
     __slots__ = ("arrivals", "came", "has", "known", "newest", "period")
 
-    def __init__(self) -> None:
+    def __init__(self, tuning: Tuning) -> None:
         self.newest = -1
         self.came = -inf
-        self.period = FIRST_PERIOD_S
-        self.arrivals: deque[tuple[int, float]] = deque(maxlen=ARRIVALS)
+        self.period = tuning.gain_first_period_s
+        self.arrivals: deque[tuple[int, float]] = deque(maxlen=tuning.gain_arrivals)
         self.has: dict[int, float] = {}
         """The newest number that a neighbour is taken to have."""
         self.known: set[int] = set()
@@ -90,7 +71,8 @@ class Gains:
     :param robots: those that it hears
     """
 
-    def __init__(self, src_id: int, robots: OtherRobots) -> None:
+    def __init__(self, src_id: int, robots: OtherRobots, tuning: Tuning = Tuning()) -> None:
+        self._tuning = tuning
         self.src_id, self.robots = src_id, robots
         self._streams: dict[Stream, _State] = {}
         self._told: dict[tuple[int, int, int], _State] = {}
@@ -134,7 +116,7 @@ class Gains:
         state.known.add(via)
         for name in self.robots.heard_by(via):
             if name != self.src_id:
-                self._count_as_heard(state, name, number, OTHERS)
+                self._count_as_heard(state, name, number, self._tuning.gain_others)
         return new
 
     def told(self, via: int, newest: Newest) -> None:
@@ -159,7 +141,9 @@ class Gains:
     def lacks(self, stream: Stream, now: float) -> bool:
         """Whether a neighbour is likely to lack its newest message."""
         period = self._streams[stream].period
-        return self.gain(stream, now) >= LIKELY * (min(period, KNOWN_S) if stream.topic_id == TABLE_TOPIC else period)
+        if stream.topic_id == TABLE_TOPIC:
+            period = min(period, self._tuning.gain_known_s)
+        return self.gain(stream, now) >= self._tuning.gain_likely * period
 
     def best(
         self,
@@ -194,33 +178,34 @@ class Gains:
                 best, found, found_worth = stream, gain, by_cost
         own = len(neighbours) * (now - self._chosen_at)  # of a message made since the choice before
         self._chosen_at = now
-        self._worth += SMOOTHING * (max(total / max(most, largest, own, 1e-9) ** 2, 1.0) - self._worth)
+        worth = max(total / max(most, largest, own, 1e-9) ** 2, 1.0)
+        self._worth += self._tuning.gain_smoothing * (worth - self._worth)
         return best, found
 
     @property
     def weight(self) -> int:
         """Packets to send while others send one."""
-        return min(max(int(1 + self._worth - EVEN), 1), MOST_WEIGHT)
+        return min(max(int(1 + self._worth - self._tuning.gain_even), 1), MOST_WEIGHT)
 
-    def sent(self, stream: Stream, number: int, now: float, share: float = OWN) -> None:
+    def sent(self, stream: Stream, number: int, now: float, share: float | None = None) -> None:
         """A message of a stream leaves.
 
-        :param share: of the way to it by which the neighbours are taken to have come
+        :param share: of the way to it by which the neighbours are taken to have come; None: ``gain_own``
         """
         state = self._streams[stream]
         for robot in self.robots.near(now):
             if robot != stream.origin:
-                self._count_as_heard(state, robot, number, share)
+                self._count_as_heard(state, robot, number, self._tuning.gain_own if share is None else share)
 
     @property
     def others(self) -> int:
         """Streams of other robots."""
         return sum(stream.origin != self.src_id for stream in self._streams)
 
-    def tells(self, count: int = TOLD) -> list[Newest]:
+    def tells(self, count: int | None = None) -> list[Newest]:
         """The newest numbers that are here of other robots' streams, in turn."""
         streams = [stream for stream in self._streams if stream.origin != self.src_id]
-        count = min(count, len(streams))
+        count = min(self._tuning.gain_told if count is None else count, len(streams))
         turn, self._turn = self._turn, self._turn + count
         told = [streams[(turn + i) % len(streams)] for i in range(count)]
         return [Newest(s.origin, s.start & 0xFF, s.topic_id, self._streams[s].newest & 0xFFFF) for s in told]
@@ -247,7 +232,7 @@ class Gains:
     def _state(self, stream: Stream) -> _State:
         state = self._streams.get(stream)
         if state is None:
-            state = self._streams[stream] = _State()
+            state = self._streams[stream] = _State(self._tuning)
             self._told[stream.origin, stream.start & 0xFF, stream.topic_id] = state
         return state
 
@@ -259,7 +244,7 @@ class Gains:
             state.has.clear()
         state.newest, state.came = number, now
         arrivals = state.arrivals
-        arrivals.append((number, max(made, now - UNKNOWN_S)))
+        arrivals.append((number, max(made, now - self._tuning.gain_unknown_s)))
         (first, since), (_, at) = arrivals[0], arrivals[-1]
         if number > first and at > since:
             state.period = (at - since) / (number - first)
@@ -268,7 +253,7 @@ class Gains:
     def _count_as_heard(self, state: _State, robot: int, number: int, share: float) -> None:
         before = state.has.get(robot)
         if before is None:
-            before = number - UNKNOWN_S / state.period
+            before = number - self._tuning.gain_unknown_s / state.period
         if number > before:
             state.has[robot] = before + share * (number - before)
 
@@ -282,7 +267,9 @@ class Gains:
             if robot != origin and not (table and origin in self.robots.all[robot].hears):
                 before = has.get(robot)
                 if before is None or (table and before <= newest - 1 and robot not in state.known):
-                    behind += UNKNOWN_S / state.period
+                    behind += self._tuning.gain_unknown_s / state.period
                 elif before < newest:
-                    behind += min(newest - before, KNOWN_S / state.period) if table else newest - before
+                    behind += (
+                        min(newest - before, self._tuning.gain_known_s / state.period) if table else newest - before
+                    )
         return behind * state.period

@@ -2,12 +2,12 @@
 
 Every message is kept with the one of its topic before it. Each robot tells up to which message of a topic it has all;
 it is sent the next ones, the oldest first. One that was sent, by this robot or by another one that it hears, is sent
-again when the robot has told since that it still lacks it: at first after ``AGAIN_S``, then after twice as long with
-each time, and not while packets with a part of it are being repaired for that robot. Of a topic that is kept for late
-robots, one that has told nothing yet but knows the table gets the newest.
+again when the robot has told since that it still lacks it: at first after ``relay_again_s``, then after twice as long
+with each time, and not while packets with a part of it are being repaired for that robot. Of a topic that is kept for
+late robots, one that has told nothing yet but knows the table gets the newest.
 
 Invariants: sans-IO, the caller passes in times; what is kept is bounded, and of the neighbours that brought it, the one
-with most of it loses first; work for a choice is bounded by ``WINDOW``, the robots that are heard and the topics.
+with most of it loses first; work for a choice is bounded by ``relay_window``, the robots that are heard and the topics.
 """
 
 from __future__ import annotations
@@ -18,17 +18,12 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import NamedTuple
 
-from gr_ros2.relay.gain import EXPIRES_S, FIRST_PERIOD_S, Gains, Stream
+from gr_ros2.core.tuning import Tuning
+from gr_ros2.relay.gain import EXPIRES_S, Gains, Stream
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Relayed
 
-AGAIN_S = 0.5
-"""s after which a message is sent again that a robot still lacks."""
-DOUBLED = 6
-"""This time is doubled so often at most."""
-WINDOW = 32
-"""Messages of a topic that are sent before a robot has told that it has the first of them."""
 COST = 2300
 """Bytes that a message takes beside its payload, one alone in its topic, sent to eight robots (measured with
 ``tracemalloc``)."""
@@ -96,7 +91,8 @@ class InOrder:
     :param quotas: where the messages are kept
     """
 
-    def __init__(self, gains: Gains, quotas: Quotas[Name]) -> None:
+    def __init__(self, gains: Gains, quotas: Quotas[Name], tuning: Tuning = Tuning()) -> None:
+        self._tuning = tuning
         self._gains, self._quotas = gains, quotas
         self._rows: dict[Stream, _Row] = {}
         self._named: dict[tuple[int, int, int], _Row] = {}
@@ -216,7 +212,7 @@ class InOrder:
             if wanted:
                 order = min(wanted)
                 kept = row.kept[bisect_left(row.orders, order)]
-                gain = wanted[order] * (now - max(kept.made, row.served) + FIRST_PERIOD_S)
+                gain = wanted[order] * (now - max(kept.made, row.served) + self._tuning.gain_first_period_s)
                 gains.append(gain)
                 if gain * gain / len(kept.message.payload or b" ") > worth:
                     best, most, worth = Name(stream, order), gain, gain * gain / len(kept.message.payload or b" ")
@@ -234,7 +230,7 @@ class InOrder:
             row.served, kept.repaired = now, repaired
             for robot in self._gains.robots.apart(name.stream.origin, now):
                 if row.has.get(robot, (-1, 0)) < name.order:
-                    kept.sent[robot] = now, min(kept.sent.get(robot, (0.0, 0))[1] + 1, DOUBLED)
+                    kept.sent[robot] = now, min(kept.sent.get(robot, (0.0, 0))[1] + 1, self._tuning.relay_doubled)
 
     # ----
 
@@ -244,12 +240,12 @@ class InOrder:
         if has is None and not self._gains.knows(robot, stream):
             return []
         begin = len(row.orders) - row.late if has is None else bisect_right(row.orders, has)
-        again = AGAIN_S * self._gains.robots.slower()
+        again = self._tuning.relay_again_s * self._gains.robots.slower()
         found = []
         if has is None and row.orders:
             row.kept_for[robot] = row.orders[-1]
         first = max(begin, 0)
-        window = 1 if has is None or has < row.kept_for.get(robot, has) else WINDOW
+        window = 1 if has is None or has < row.kept_for.get(robot, has) else self._tuning.relay_window
         for n in range(first, min(first + window, len(row.orders))):
             kept = row.kept[n]
             at, times = kept.sent.get(robot, (-inf, 0))

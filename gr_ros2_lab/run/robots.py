@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.gr.factory import Start, keys_of_run
 from gr_ros2.link.air import Air
 from gr_ros2.link.airtime_limit import sustained
@@ -31,14 +32,14 @@ def start_of_run(scenario: Scenario) -> Start:
     return Start(scenario.seed + 1, keys_of_run(scenario.first))
 
 
-def air_of_run(scenario: Scenario, phy: Phy) -> Air:
+def air_of_run(scenario: Scenario, phy: Phy, tuning: Tuning = Tuning()) -> Air:
     """What the endpoints of all robots of a run know of their radios."""
     return Air(
         hears=scenario.reports,
         half_duplex=scenario.duplex == "half",
         any_length=phy.any_length,
         mcs_table=phy.mcs_table,
-        access=access_of(scenario.medium, phy.airtime(), scenario.seed),
+        access=access_of(scenario.medium, phy.airtime(), scenario.seed, tuning=tuning),
         relay=scenario.relay == "gain",
         airtime_s=phy.airtime(),
         airtime_share=sustained(scenario.airtime.rule),

@@ -23,6 +23,7 @@ from typing import Any, Protocol
 from gr_ros2.codecs.frames import FrameSender, TimedCoder
 from gr_ros2.codecs.received_frames import FrameReceiver
 from gr_ros2.core.errors import BagError, CodecError, ConfigError, RunError
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.gr.factory import make_endpoint
 from gr_ros2.link import Delivered, Lost, Received, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
@@ -174,6 +175,7 @@ def simulate(
     phy: Phy | None = None,
     messages: Sequence[Iterator[Offered]] | None = None,
     codec: MessageCodec | None = None,
+    tuning: Tuning = Tuning(),
     on_packet: Callable[[SentPacket], None] | None = None,
     overhead_s: float = 0.0,
 ) -> Simulated:
@@ -185,6 +187,7 @@ def simulate(
     :param phy: None makes the scenario's
     :param messages: those that each robot that sends is offered, in time order; None takes the scenario's source
     :param codec: of all messages; None makes one
+    :param tuning: of all robots
     :param on_packet: called with every packet that leaves a robot
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
     :raises ConfigError: when the scenario cannot be set up
@@ -194,7 +197,7 @@ def simulate(
     phy = phy or make_phy(scenario, registry)
     if phy.mcs_table:
         raise ConfigError("rate = 'adaptive': a forecast has one rate; set phy.options.rate to fixed")
-    run = Simulation(scenario, registry, phy, messages=messages, codec=codec, ideal=True)
+    run = Simulation(scenario, registry, phy, messages=messages, codec=codec, tuning=tuning, ideal=True)
     senders = senders_of(scenario.all_robots)
     ids = [robot.robot_id for robot in senders]
     listeners = {src_id: hearer_of(run.around, number) for number, src_id in enumerate(ids)}
@@ -245,6 +248,7 @@ class Simulation:
     :param messages: those that each robot that sends is offered, in time order; None takes the scenario's source
     :param task: offers them instead, and moves the robots
     :param codec: of all messages; None makes one
+    :param tuning: of all robots
     :param ideal: the PHY loses nothing, unless its levels were measured
     """
 
@@ -257,11 +261,12 @@ class Simulation:
         messages: Sequence[Iterator[Upcoming]] | None = None,
         task: TaskRun | None = None,
         codec: MessageCodec | None = None,
+        tuning: Tuning = Tuning(),
         ideal: bool = False,
     ) -> None:
         if messages is None:
             messages = offered_by(scenario, registry) if task is None else task.offered()
-        self.robots = _robots(scenario, registry, phy, messages, codec=codec, busy=ideal)
+        self.robots = _robots(scenario, registry, phy, messages, codec=codec, tuning=tuning, busy=ideal)
         self.around = around = surroundings(scenario, phy.sample_rate, task)
         shared, phys = scenario.duplex == "half", [phy] * len(self.robots)
         if ideal:
@@ -306,10 +311,11 @@ def _robots(
     messages: Sequence[Iterator[Upcoming]],
     *,
     codec: MessageCodec | None = None,
+    tuning: Tuning = Tuning(),
     busy: bool = False,
 ) -> list[Robot]:
     """The robots of a run, those that send first; see :class:`Simulation` and :class:`Robot`."""
-    start, air, coming = start_of_run(scenario), air_of_run(scenario, phy), iter(messages)
+    start, air, coming = start_of_run(scenario), air_of_run(scenario, phy, tuning), iter(messages)
     airtime = cache(phy.airtime)
     robots: list[Robot] = []
     for number, settings in enumerate(scenario.all_robots):
@@ -318,7 +324,7 @@ def _robots(
         endpoint: Endpoint
         common: dict[str, Any] = {"codec": codec, "observer": events.append}
         if scenario.paper is None:
-            endpoint = make_endpoint(config, registry, air=air, start=start, **common)
+            endpoint = make_endpoint(config, registry, air=air, start=start, tuning=tuning, **common)
         else:
             endpoint = make_paper_endpoint(config, scenario.paper, registry, rng=rng, **common)
         robot = Robot(

@@ -10,7 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.rate import MOST_SILENT_S, Mcs, RateController
+from gr_ros2.core.tuning import Tuning
+from gr_ros2.link.rate import Mcs, RateController
+
+TUNING = Tuning()
 
 MCS_TABLE = tuple(
     Mcs(name, airtime_s, half_db, 0.4)
@@ -28,7 +31,7 @@ REPORT_S = 0.02
 def settled(snr_db: float, *, reports: int = 200, noise_db: float = 0.0, seed: int = 0) -> list[int]:
     """The MCS after each of some reports of a constant SNR, measured with some error."""
     draw = random.Random(seed)
-    rate = RateController(MCS_TABLE)
+    rate = RateController(MCS_TABLE, TUNING)
     rate.meet(7)
     rates = [0]
     for number in range(reports):
@@ -56,7 +59,7 @@ def test_at_an_edge_the_rate_is_one_of_two_though_the_snr_is_measured_with_error
 
 
 def test_an_snr_that_is_wrong_is_corrected_by_the_losses() -> None:
-    rate = RateController(MCS_TABLE)
+    rate = RateController(MCS_TABLE, TUNING)
     rate.meet(7)
     mcs = 0
     for number in range(200):
@@ -67,7 +70,7 @@ def test_an_snr_that_is_wrong_is_corrected_by_the_losses() -> None:
 
 
 def test_packets_that_were_not_for_a_robot_say_nothing_of_it() -> None:
-    rate = RateController(MCS_TABLE)
+    rate = RateController(MCS_TABLE, TUNING)
     rate.meet(7)
     for number in range(200):
         rate.report(7, 9.4, 0.75, number * REPORT_S, not_for=0.75)
@@ -81,14 +84,14 @@ def test_packets_that_were_not_for_a_robot_say_nothing_of_it() -> None:
 
 def test_a_robot_that_has_not_reported_is_expected_to_lose_all() -> None:
     """And not NaN, which the loss that repairs count on became then."""
-    rate = RateController(MCS_TABLE)
+    rate = RateController(MCS_TABLE, TUNING)
     assert rate.lost(1, 0, 5.0) == pytest.approx(1.0)
     rate.meet(1)
     assert rate.lost(1, 0, 5.0) == pytest.approx(1.0)
 
 
 def test_a_packet_for_everybody_serves_the_weakest() -> None:
-    rate = RateController(MCS_TABLE)
+    rate = RateController(MCS_TABLE, TUNING)
     for robot in (1, 2):
         rate.meet(robot)
     for number in range(100):
@@ -104,30 +107,30 @@ def test_a_packet_for_everybody_serves_the_weakest() -> None:
 
 
 def test_a_robot_that_falls_silent_gets_the_most_robust_rate() -> None:
-    rate = RateController(MCS_TABLE)
+    rate = RateController(MCS_TABLE, TUNING)
     rate.meet(7)
     for number in range(100):
         rate.report(7, 30.0, 0.0, number * REPORT_S)
     now = 99 * REPORT_S
     assert rate.sent([7], now) == 4
-    assert rate.sent([7], now + MOST_SILENT_S / 2) == 4, "nothing was sent that it could have reported"
+    assert rate.sent([7], now + TUNING.rate_most_silent_s / 2) == 4, "nothing was sent that it could have reported"
     for _ in range(20):
-        rate.sent([7], now + MOST_SILENT_S / 2)
-    assert rate.sent([7], now + MOST_SILENT_S / 2) == 0
-    rate.report(7, 30.0, 0.0, now + MOST_SILENT_S / 2)
-    assert rate.sent([7], now + MOST_SILENT_S / 2) == 4, "it is heard again"
-    assert rate.sent([7], now + 2 * MOST_SILENT_S) == 0
+        rate.sent([7], now + TUNING.rate_most_silent_s / 2)
+    assert rate.sent([7], now + TUNING.rate_most_silent_s / 2) == 0
+    rate.report(7, 30.0, 0.0, now + TUNING.rate_most_silent_s / 2)
+    assert rate.sent([7], now + TUNING.rate_most_silent_s / 2) == 4, "it is heard again"
+    assert rate.sent([7], now + 2 * TUNING.rate_most_silent_s) == 0
 
 
 def test_nobody_known_gets_the_most_robust_rate() -> None:
-    rate = RateController(MCS_TABLE)
+    rate = RateController(MCS_TABLE, TUNING)
     assert rate.sent(None, 0.0) == rate.sent([9], 0.0) == 0
 
 
 @pytest.mark.parametrize("mcs_table", [(), MCS_TABLE[::-1], (MCS_TABLE[0], MCS_TABLE[0])])
 def test_an_mcs_table_goes_up(mcs_table: tuple[Mcs, ...]) -> None:
     with pytest.raises(ConfigError, match="MCS table"):
-        RateController(mcs_table)
+        RateController(mcs_table, TUNING)
 
 
 @given(
@@ -137,7 +140,7 @@ def test_an_mcs_table_goes_up(mcs_table: tuple[Mcs, ...]) -> None:
     )
 )
 def test_any_course_of_events_gives_a_rate_of_the_table(events: list[tuple[str, int, float, float, float]]) -> None:
-    rate, now = RateController(MCS_TABLE), 0.0
+    rate, now = RateController(MCS_TABLE, TUNING), 0.0
     for kind, robot, snr_db, loss, wait in events:
         now += wait
         if kind == "r":
@@ -152,7 +155,7 @@ def test_any_course_of_events_gives_a_rate_of_the_table(events: list[tuple[str, 
 def faded(depth_db: float, *, slope_db_s: float = 150.0, report_s: float = 0.006) -> tuple[RateController, float, int]:
     """A controller whose robot reports an SNR that swings, and then falls from 20 dB: the time of the last report, and
     the MCS after it."""
-    rate, now = RateController(MCS_TABLE), 0.0
+    rate, now = RateController(MCS_TABLE, TUNING), 0.0
     rate.meet(7)
     for number in range(400):  # the channel is one that changes all the time
         now += report_s
@@ -175,7 +178,7 @@ def test_in_a_fade_the_rate_goes_down_though_no_report_comes() -> None:
 
 
 def test_in_a_constant_channel_the_rate_stays_for_the_same_time() -> None:
-    rate = RateController(MCS_TABLE)
+    rate = RateController(MCS_TABLE, TUNING)
     rate.meet(7)
     for number in range(400):
         rate.report(7, 20.0, 0.0, number * 0.006)

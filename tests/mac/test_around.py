@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from gr_ros2.mac.around import DEAF, HEARD, LATELY, Around, SlotOwner
+from gr_ros2.core.tuning import Tuning
+from gr_ros2.mac.around import Around, SlotOwner
+
+TUNING = Tuning()
 
 
 def with_robots(*slots: int) -> Around:
-    around = Around()
+    around = Around(TUNING)
     for robot, slot in enumerate(slots):
         around.heard(slot)
         around.robots[robot] = SlotOwner(slot)
@@ -15,11 +18,11 @@ def with_robots(*slots: int) -> Around:
 
 def test_a_robot_counts_as_heard_for_a_number_of_slots() -> None:
     around = with_robots(0, 100)
-    assert len(around.present(HEARD)) == 2
-    assert len(around.present(HEARD + 1)) == 1
-    assert not around.nobody(100 + LATELY)
-    assert around.nobody(101 + LATELY)
-    around.forget(2 * HEARD + 1, elsewhere_before=0.0)
+    assert len(around.present(TUNING.slots_heard)) == 2
+    assert len(around.present(TUNING.slots_heard + 1)) == 1
+    assert not around.nobody(100 + TUNING.slots_lately)
+    assert around.nobody(101 + TUNING.slots_lately)
+    around.forget(2 * TUNING.slots_heard + 1, elsewhere_before=0.0)
     assert list(around.robots) == [1]
 
 
@@ -40,9 +43,9 @@ def test_those_are_named_first_that_were_named_the_longest_time_ago() -> None:
 def test_a_neighbour_that_does_not_expect_this_robot_is_found() -> None:
     around = with_robots(0)
     assert not around.deaf(0)
-    around.robots[0].deaf = DEAF
-    assert around.deaf(LATELY)
-    assert not around.deaf(LATELY + 1)
+    around.robots[0].deaf = TUNING.slots_deaf
+    assert around.deaf(TUNING.slots_lately)
+    assert not around.deaf(TUNING.slots_lately + 1)
 
 
 def test_when_slots_are_counted_otherwise_all_are_elsewhere() -> None:

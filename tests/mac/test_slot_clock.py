@@ -6,13 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.mac.slot_clock import BEHIND, MEMORY, PATIENCE, STAYS, SlotClock
+from gr_ros2.core.tuning import Tuning
+from gr_ros2.mac.slot_clock import SlotClock
+
+TUNING = Tuning()
 
 SLOT = 0.015
 
 
 def clock(now: float = 100.0) -> SlotClock:
-    made = SlotClock(SLOT)
+    made = SlotClock(SLOT, TUNING)
     made.start(now)
     made.said()
     return made
@@ -26,7 +29,7 @@ def hear(
 
 
 def test_the_first_packet_heard_decides_where_the_slots_are() -> None:
-    made = SlotClock(SLOT)
+    made = SlotClock(SLOT, TUNING)
     assert not made.runs
     assert made.heard(1, 200, 50.0, trusted=True) == 200
     assert made.begin(200) == pytest.approx(50.0)
@@ -58,7 +61,7 @@ def test_a_robot_whose_clock_has_jumped_is_given_time_to_notice() -> None:
     made = clock()
     for n in range(10):
         hear(made, 1 + n % 2, n)
-    slots = PATIENCE
+    slots = TUNING.clock_patience
     for n in range(10, 10 + slots - 1, 2):
         assert hear(made, 1, n, -1.0) is None
         assert hear(made, 2, n + 1) == n + 1
@@ -83,12 +86,12 @@ def test_packets_that_are_not_trusted_move_nobody_who_hears_others() -> None:
     assert hear(made, 2, 1, -1.0, trusted=False) is None
     assert hear(made, 2, 2, 0.1 * SLOT, trusted=False) == 2
     assert made.begin(0) == before
-    late = 60 + MEMORY
+    late = 60 + TUNING.clock_memory
     assert hear(made, 2, late, -0.7, trusted=False) is not None
 
 
 def test_what_was_not_checked_starts_a_clock_and_moves_none() -> None:
-    made = SlotClock(SLOT)
+    made = SlotClock(SLOT, TUNING)
     assert made.heard(2, 7, 50.0, trusted=False) == 7
     assert made.heard(3, 9, 50.0 + 4.3 * SLOT, trusted=False) is None
     assert made.heard(3, 7, 50.0 + 0.1 * SLOT, trusted=False) == 7
@@ -104,13 +107,13 @@ def test_where_nobody_agrees_who_is_behind_is_followed_sooner() -> None:
         if agreed:
             hear(made, 1, 0)
         assert hear(made, 2, 1, 0.4 * SLOT) is None
-        hear(made, 2, PATIENCE + 2, 0.4 * SLOT)
+        hear(made, 2, TUNING.clock_patience + 2, 0.4 * SLOT)
         assert made.jumps == (0 if agreed else 1)
 
 
 def test_a_group_that_stays_behind_is_told_in_its_own_slots() -> None:
     made = clock()
-    slots, stays = BEHIND, STAYS
+    slots, stays = TUNING.clock_behind, TUNING.clock_stays
     for n in range(0, 2 * slots, 2):
         hear(made, 1, n)
         if hear(made, 2, n + 1, 0.4) is not None:
@@ -118,12 +121,12 @@ def test_a_group_that_stays_behind_is_told_in_its_own_slots() -> None:
     assert n == pytest.approx(slots, abs=2)
     assert made.jumps == 1
     assert hear(made, 1, n + stays - 9, -0.4) is None, "it would leave before it is heard"
-    assert hear(made, 1, n + MEMORY + 40, -0.4) is not None
+    assert hear(made, 1, n + TUNING.clock_memory + 40, -0.4) is not None
 
 
 def test_a_clock_that_nobody_can_follow_yet_moves_to_whoever_is_heard() -> None:
     for error in (-0.5, 0.5):
-        made = SlotClock(1.0)
+        made = SlotClock(1.0, TUNING)
         made.start(100.0)
         assert made.heard(2, 0, 110.0 + error, trusted=True) is not None
         assert made.jumps == 1

@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 
 from fuzz.loop import work
 from gr_ros2.core.errors import EntryBoundsError
-from gr_ros2.mac.around import HEARD
-from gr_ros2.mac.slots import CHOICE, FILLED, NEWCOMER, QUIET, Slots
+from gr_ros2.core.tuning import Tuning
+from gr_ros2.mac.slots import Slots
 from gr_ros2.wire.mac_block import NOBODY, Block, read_block
+
+TUNING = Tuning()
 
 SLOT = 0.0145
 
@@ -111,7 +113,7 @@ def test_video_gets_more_slots_and_no_other_turn_comes_one_and_a_half_times_as_l
         assert even / 1.55 < beside
         assert after > 0.95 * even
     even, filled, after = (share(sent, 0, *span) for span in ((1000, 2000), (2300, 3000), (3300, 4000)))
-    extra = int(FILLED * (count + 1))
+    extra = int(TUNING.slots_filled * (count + 1))
     assert filled > 0.95 * 100 * (1 + extra) / (count + 1 + extra) > 1.3 * even
     assert after < 1.1 * even
 
@@ -125,7 +127,7 @@ def test_video_does_not_vie_with_who_relays_much() -> None:
         begin = made.departure(begin + SLOT / 2)
         if (data := made.block(fills=True)) is not None:
             weights.append(read_block(data)[0].weight)
-    assert 1 < max(weights) <= 1 + int(FILLED * 3)
+    assert 1 < max(weights) <= 1 + int(TUNING.slots_filled * 3)
 
 
 @pytest.mark.parametrize("cameras", [2, 3, 10])
@@ -140,13 +142,13 @@ def test_several_robots_with_video_share_what_it_may_take(cameras: int) -> None:
 
 def test_a_robot_with_weight_sends_as_often_and_says_so() -> None:
     made = robot()
-    later = NEWCOMER + 1
+    later = TUNING.slots_newcomer + 1
     for other in range(16):
         hear(made, 10 + other, 70 + other, Block(0, (300, 300), 8, (5, NOBODY)))
         hear(made, 10 + other, 70 + other + later, Block(0, (300, 300), 8, (5, NOBODY)))
     begin, block = send(made, 1.5 + later * SLOT, weight=4)
     assert (block.weight, block.heard) == (4, 16)
-    assert (16 + 4 + 1) // 4 <= block.ahead[1] < (16 + 4 + 1) // 4 + CHOICE
+    assert (16 + 4 + 1) // 4 <= block.ahead[1] < (16 + 4 + 1) // 4 + TUNING.slots_choice
     hear(made, 10, made.clock.slot(begin + SLOT / 2) + 1, Block(0, (300, 300), 8, (5, NOBODY), 0, weight=3))
     _, block = send(made, begin + SLOT)
     assert (block.weight, block.heard) == (1, 18)
@@ -157,7 +159,7 @@ def test_frames_have_a_slot_for_each_newcomer_until_it_is_none_any_more() -> Non
     for other in range(16):
         hear(made, 10 + other, 70 + other, Block(0, (300, 300), 16, (5, NOBODY)))
     assert made._frame(90, made.around.loads(90, 1)) == 17 + 1 + 16
-    late = 70 + NEWCOMER
+    late = 70 + TUNING.slots_newcomer
     assert made._frame(late + 8, made.around.loads(late + 8, 1)) == 17 + 1 + 8
     assert made._frame(late + 16, made.around.loads(late + 16, 1)) == 17 + 1
 
@@ -170,12 +172,12 @@ def test_a_robot_that_hears_other_slots_counts_who_has_them_and_picks_at_random_
     made.hear(9, Block(62, (300, 300), 1, (5, NOBODY)), 62.5 * SLOT)
     assert max(made.around.loads(70, 1)) == before + 1
     made._confirmed_at = 70
-    assert len({made._pick(77, 70, 20) for _ in range(100)}) == CHOICE
-    made._confirmed_at = late = 70 + 2 * HEARD
+    assert len({made._pick(77, 70, 20) for _ in range(100)}) == TUNING.slots_choice
+    made._confirmed_at = late = 70 + 2 * TUNING.slots_heard
     made._sweep(late)
     hear(made, 7, late, Block(0, (300, 300), 1, (5, NOBODY)))
     assert made.around.loads(late, 1)[0] == 2
-    assert len({made._pick(late + 7, late, 20) for _ in range(100)}) < CHOICE
+    assert len({made._pick(late + 7, late, 20) for _ in range(100)}) < TUNING.slots_choice
 
 
 def test_a_slot_in_whose_place_somebody_sends_one_frame_before_is_passed_over() -> None:
@@ -326,14 +328,14 @@ def test_who_is_heard_for_a_moment_only_need_not_have_named_this_robot(moves: bo
         made._start_over(1000, 14.5)
     for slot in range(1001, 1800, 5):
         hear(made, 2, slot, Block(0, (5, 5), 1, (NOBODY, NOBODY)))
-        assert not made.unheard(made.clock.begin(slot + 1)) or slot > 1000 + 3 * HEARD
+        assert not made.unheard(made.clock.begin(slot + 1)) or slot > 1000 + 3 * TUNING.slots_heard
     assert made.unheard(made.clock.begin(1800))
 
 
 def test_a_robot_that_asks_ahead_of_the_end_of_its_silence_gets_a_slot_after_it() -> None:
     made = Slots(5, SLOT, random.Random(1), period_s=0.1)
     at = made.departure(3.0)
-    assert at == pytest.approx(3.0 + QUIET * SLOT)
+    assert at == pytest.approx(3.0 + TUNING.slots_quiet * SLOT)
     assert made.block() is None
     assert made.departure(at - 0.005) > at
 
@@ -407,7 +409,7 @@ def test_robots_that_left_are_forgotten() -> None:
     begin, _ = send(made, 71 * SLOT)
     for _ in range(60):
         begin, block = send(made, begin + SLOT)
-    assert begin > HEARD * SLOT + 2
+    assert begin > TUNING.slots_heard * SLOT + 2
     assert block.heard == 0
 
 

@@ -6,11 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.relay.gain import EVEN, EXPIRES_S, KNOWN_S, OWN, UNKNOWN_S, Gains, Stream
+from gr_ros2.core.tuning import Tuning
+from gr_ros2.relay.gain import EXPIRES_S, Gains, Stream
 from gr_ros2.relay.robots import NEAR_S, OtherRobots
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import MOST_WEIGHT
 from gr_ros2.wire.v1 import TABLE_TOPIC
+
+TUNING = Tuning()
 
 ODOM = Stream(7, 0xCAFE, 0)
 
@@ -32,7 +35,7 @@ def test_who_has_sent_a_message_needs_it_no_more() -> None:
 
 def test_a_neighbour_that_has_heard_nothing_of_a_robot_is_worth_most() -> None:
     gains = hearing(2, 3)
-    assert gains.best(1.0) == (ODOM, pytest.approx(UNKNOWN_S))
+    assert gains.best(1.0) == (ODOM, pytest.approx(TUNING.gain_unknown_s))
 
 
 def test_the_gain_is_the_time_that_a_neighbour_is_behind() -> None:
@@ -40,7 +43,7 @@ def test_the_gain_is_the_time_that_a_neighbour_is_behind() -> None:
     gains.told(3, Newest(7, 0xFE, 0, 4))
     assert gains.gain(ODOM, 1.0) == pytest.approx(0.6)
     gains.sent(ODOM, gains.has(ODOM), 1.0)
-    assert gains.gain(ODOM, 1.0) == pytest.approx(0.6 * (1 - OWN))
+    assert gains.gain(ODOM, 1.0) == pytest.approx(0.6 * (1 - TUNING.gain_own))
 
 
 def test_what_was_sent_is_likely_there_until_the_neighbour_tells_that_it_is_not() -> None:
@@ -60,7 +63,7 @@ def test_the_weight_grows_with_the_messages_that_wait_to_be_relayed() -> None:
         gains.message(2, Stream(7, 0xCAFE, topic_id), 1, 1.0)
         for _ in range(80):
             gains.best(1.0)
-        assert abs(gains.weight - min(max(topic_id + 2 - EVEN, 1), MOST_WEIGHT)) <= 1
+        assert abs(gains.weight - min(max(topic_id + 2 - TUNING.gain_even, 1), MOST_WEIGHT)) <= 1
     gains.neighbour(2, 100.0)
     for now in range(100, 150):
         gains.best(float(now))
@@ -117,8 +120,8 @@ def test_a_table_that_a_robot_lacks_goes_before_those_that_tell_that_robots_are_
         for robot in (3, 4):
             gains.told(robot, Newest(8, 0xFE, TABLE_TOPIC, 1))
     gains.told(3, Newest(7, 0xFE, TABLE_TOPIC, 1))
-    assert gains.gain(renewed, 1.0) == pytest.approx(2 * KNOWN_S)
-    assert gains.gain(lacked, 1.0) == pytest.approx(UNKNOWN_S + KNOWN_S)
+    assert gains.gain(renewed, 1.0) == pytest.approx(2 * TUNING.gain_known_s)
+    assert gains.gain(lacked, 1.0) == pytest.approx(TUNING.gain_unknown_s + TUNING.gain_known_s)
     gains.changed(renewed)
     assert gains.gain(renewed, 1.0) > gains.gain(lacked, 1.0)
     for robot in (2, 3, 4):
@@ -127,7 +130,7 @@ def test_a_table_that_a_robot_lacks_goes_before_those_that_tell_that_robots_are_
     assert gains.lacks(lacked, 100.0)
     for robot in (2, 3, 4):
         gains.neighbour(robot, 200.0)
-    assert gains.gain(lacked, 200.0) > 2 * UNKNOWN_S, "they were away, and may have forgotten"
+    assert gains.gain(lacked, 200.0) > 2 * TUNING.gain_unknown_s, "they were away, and may have forgotten"
 
 
 def test_a_table_that_takes_several_packets_counts_for_as_many() -> None:
@@ -144,7 +147,7 @@ def test_a_table_that_takes_several_packets_counts_for_as_many() -> None:
 def test_own_messages_compete_with_those_of_others() -> None:
     gains = hearing(2, 3)
     gains.own(0, 5, 1, 1.0)
-    assert gains.best(1.0) == (Stream(1, 5, 0), pytest.approx(2 * UNKNOWN_S))
+    assert gains.best(1.0) == (Stream(1, 5, 0), pytest.approx(2 * TUNING.gain_unknown_s))
 
 
 def test_every_stream_is_told_in_turn() -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from math import inf
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.relay.gain import EXPIRES_S, Gains, Stream
-from gr_ros2.relay.in_order import AGAIN_S, COST, InOrder, Kept, Name
+from gr_ros2.relay.in_order import COST, InOrder, Kept, Name
 from gr_ros2.relay.memory import Memory
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.relay.robots import OtherRobots
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Relayed
 from gr_ros2.wire.v1 import TABLE_TOPIC
+
+TUNING = Tuning()
 
 GOAL = Stream(1, 7, 3)
 
@@ -59,7 +62,7 @@ def test_what_a_robot_still_lacks_is_sent_again_once_it_has_told_so() -> None:
     kept.sent(Name(GOAL, (1, 0)), 0.1)
     assert chosen(kept, 2.0) is None, "it has told nothing since"
     kept.told(3, told(0), 1.0)
-    assert chosen(kept, 0.1 + AGAIN_S / 2) is None
+    assert chosen(kept, 0.1 + TUNING.relay_again_s / 2) is None
     assert chosen(kept, 2.0) == 1
     kept.told(3, told(1), 1.0)
     assert chosen(kept, 2.0) is None

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.rate import RateController
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.peers import Peers
@@ -27,8 +28,6 @@ from gr_ros2.wire.v1 import BROADCAST
 
 NEVER_S = 1e6
 """Age in s of a topic of which nothing was sent to a robot: it goes before all others."""
-_SMOOTHING = 1 / 32
-"""As in reports of what is lost."""
 _REACH = 160
 """Packets over which it is taken: what was before has a part of .006."""
 _REMEMBERED = 1024
@@ -70,7 +69,9 @@ class Audiences:
         reads: Callable[[int], bool],
         room: int,
         short: int,
+        tuning: Tuning,
     ) -> None:
+        self._tuning = tuning
         self._rate, self._peers, self._packets, self._topics = rate, peers, packets, topics
         self._reads, self._room, self._short = reads, room, short
         self._robots: frozenset[int] = frozenset()
@@ -222,5 +223,5 @@ class Audiences:
         share = 0.0
         if self._lost:
             for one in range(number - _REACH + 1, number + 1):
-                share += (self._lost.get(one, _NOTHING).get(robot, 0.0) - share) * _SMOOTHING
+                share += (self._lost.get(one, _NOTHING).get(robot, 0.0) - share) * self._tuning.report_smoothing
         return share

@@ -14,11 +14,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.gf256 import combine
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.wire.v1 import MAX_WINDOW
-
-_GOLDEN = (5**0.5 - 1) / 2
 
 
 class Repair(NamedTuple):
@@ -43,8 +42,8 @@ class Combining:
     :param room: bytes of the longest body
     """
 
-    def __init__(self, packets: SentPackets, room: int) -> None:
-        self._packets = packets
+    def __init__(self, packets: SentPackets, room: int, tuning: Tuning) -> None:
+        self._packets, self._tuning = packets, tuning
         self._room = room
         self._place = 0.0
 
@@ -55,7 +54,7 @@ class Combining:
         beyond the ends are moved to the ends, so that the packets there are in as many windows as others.
         """
         packets = self._packets
-        self._place = (self._place + _GOLDEN) % 1
+        self._place = (self._place + self._tuning.window_step) % 1
         span = packets.newest - packets.needed + 1
         if span <= MAX_WINDOW:
             first, last = packets.needed, packets.newest

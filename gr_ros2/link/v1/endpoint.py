@@ -96,9 +96,9 @@ class EndpointV1:
         self.mcs_table = tuple(mcs_table)
         self.answers = bool(topics) or settings.hears
         self._now = -inf
-        rate = RateController(mcs_table) if mcs_table else None
+        rate = RateController(mcs_table, settings.tuning) if mcs_table else None
         self.pace = pace = Pace(settings.packet_rate)
-        self._hold = hold = Hold()
+        self._hold = hold = Hold(settings.tuning)
         room = room_of(settings, keys, block=access is not None)
         self.window = window = RepairWindow(
             settings.repair,
@@ -108,6 +108,7 @@ class EndpointV1:
             proves=keys.sealed and settings.hears and settings.idle_is_free,
             slower=settings.slower,
             pace=pace,
+            tuning=settings.tuning,
         )
         self.messages = messages = Outbox(
             topics,

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.access import Access
 from gr_ros2.link.air import Air
 from gr_ros2.link.v1.repair import RepairMode
@@ -18,9 +19,6 @@ from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, REPAIR_HEADER_LEN, TAG_LEN
 
-TURN_S = 1 / 3
-"""s from one packet of a robot to its next up to which the times that rules wait for packets hold as they are written:
-some packets of others, whatever their airtime. Twenty robots in one cell at 75 packets/s have a turn so often."""
 MIN_PACKET_LEN = HEADER_LEN + REPAIR_HEADER_LEN + TAG_LEN + 26
 
 
@@ -56,6 +54,7 @@ class Settings:
     :param packet_s: tells s from one packet of this robot to its next, where nobody shares its channel and it always
         has one; 0 = not known
     :param beacon_s: s without hearing any robot after which one hello leaves every so many s, and nothing else; 0 = off
+    :param tuning: the constants that were found by measurement
     """
 
     src_id: int
@@ -82,6 +81,7 @@ class Settings:
     airtime_share: float = 1.0
     packet_s: Callable[[], float] = field(default=lambda: 0.0, compare=False)
     beacon_s: float = 0.0
+    tuning: Tuning = Tuning()
 
     def __post_init__(self) -> None:
         if not MIN_PACKET_LEN <= self.packet_len <= 4095:
@@ -107,7 +107,7 @@ class Settings:
     def slower(self) -> float:
         """By how much longer than written rules wait for packets of others, and by how much more rarely a robot speaks
         of itself: turns come less often on a slow channel, on one that many share, and with a limit of airtime."""
-        return max(1.0, self.turn_s() / TURN_S) / self.airtime_share
+        return max(1.0, self.turn_s() / self.tuning.turn_s) / self.airtime_share
 
     @property
     def turns_are_rare(self) -> bool:
@@ -120,7 +120,7 @@ class Settings:
         return self.airtime_share == 1 and not (self.half_duplex or self.shares)
 
 
-def end_settings(robot: RobotConfig, air: Air, *, loops_back: bool = False) -> Settings:
+def end_settings(robot: RobotConfig, air: Air, *, loops_back: bool = False, tuning: Tuning = Tuning()) -> Settings:
     """The settings of a robot's end.
 
     :param loops_back: whether it receives what it sends itself, and takes packets of and for any robot
@@ -151,4 +151,5 @@ def end_settings(robot: RobotConfig, air: Air, *, loops_back: bool = False) -> S
         airtime_share=air.airtime_share,
         packet_s=lambda: air.airtime_s,
         beacon_s=robot.beacon_s,
+        tuning=tuning,
     )

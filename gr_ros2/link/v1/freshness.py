@@ -7,21 +7,19 @@ message with the greatest ``weight * g^2 / c`` first achieves that.
 
 *Classes.* Messages of class latency go first, then default, then bulk in what is left.
 
-*Turns.* Every ``TURN``-th packet belongs to the topic whose last turn is longest ago.
+*Turns.* Every ``turn_every``-th packet belongs to the topic whose last turn is longest ago.
 
-Invariant: nothing starves: a topic that always has something waiting gets a turn within TURN times the number of
-topics.
+Invariant: nothing starves: a topic that always has something waiting gets a turn within ``turn_every`` times the number
+of topics.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.queues import Outgoing
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY
-
-TURN = 4
-"""One packet in this many belongs to the topic whose last turn is longest ago."""
 
 RANK = {QOS_LATENCY: 0, QOS_DEFAULT: 1, QOS_BULK: 2}
 """The order of the classes."""
@@ -38,9 +36,10 @@ def value(message: Outgoing, before: float, cost: int) -> float:
 
 
 class Turns:
-    """Decides whose turn it is: every ``TURN``-th packet belongs to the topic whose last turn is longest ago."""
+    """Decides whose turn it is: every ``turn_every``-th packet belongs to the topic whose last turn is longest ago."""
 
-    def __init__(self) -> None:
+    def __init__(self, tuning: Tuning) -> None:
+        self._tuning = tuning
         self._line: list[int] = []
         self._packets = 0
 
@@ -51,7 +50,7 @@ class Turns:
 
     def holder(self, pending: Collection[int]) -> int:
         """The topic to which the next packet belongs, one of ``pending``; -1 for none."""
-        if self._packets % TURN == TURN - 1:
+        if self._packets % self._tuning.turn_every == self._tuning.turn_every - 1:
             for topic_id in self._line:
                 if topic_id in pending:
                     return topic_id

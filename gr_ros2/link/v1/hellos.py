@@ -22,7 +22,6 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbours
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.repair import RepairWindow
-from gr_ros2.link.v1.reports import CALM
 from gr_ros2.wire.control import (
     CAN_HEAR,
     ENCRYPTS,
@@ -37,32 +36,6 @@ from gr_ros2.wire.control import (
 )
 
 _T = TypeVar("_T")
-
-STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
-"""Times in s after the start at which hellos are sent."""
-HELLO_BYTES_S = 50.0
-"""Bytes/s that hellos take that are not early, as far as the interval stays between ``OFTEN_S`` and ``SELDOM_S``."""
-OFTEN_S = 1.0
-"""s between two hellos at least, once they are regular."""
-SELDOM_S = 2.0
-"""s between two hellos at most, while others are heard."""
-LONE_S = 10.0
-"""Most s between two hellos of a robot that hears nobody and says nothing: the time doubles with each hello, as in
-Trickle (RFC 6206). A robot that starts is met at once, by its own hellos."""
-EARLY = 0.25
-"""Part of the longest time to the next hello by which it comes early at most; RFC 5148 advises no more. The mean is the
-period: with one that is an eighth shorter, hellos make 1 in 100 messages late that fill a link one way."""
-EAGER_S = 0.1
-"""s between hellos while another robot has not proven yet that it heard this start: until then its messages are not
-delivered."""
-EAGER = 20
-"""Number of these hellos."""
-RESTS = 2
-"""Packets of messages, if any wait, between two hellos on a slow channel where somebody has named this robot: a row of
-the table and its message, for example. Who is met would say nothing but hellos there for its next five turns. Where
-nobody has named it, its hello was lost, and nothing else tells who it is."""
-LATENCY_S = 0.15
-"""s for which a hello lets messages of class latency go first."""
 
 
 class Hellos:
@@ -82,7 +55,7 @@ class Hellos:
         *,
         encrypts: bool,
     ) -> None:
-        self._settings = settings
+        self._settings, self._tuning = settings, settings.tuning
         self._messages, self._window, self._neighbours = messages, window, neighbours
         self._boot = boot
         self._rng = random.Random(f"hellos {boot} {settings.src_id}")
@@ -103,7 +76,7 @@ class Hellos:
 
     def start(self, now: float) -> None:
         """The first packet may be sent now."""
-        self._starting = deque(now + after * self._settings.slower for after in STARTING_S)
+        self._starting = deque(now + after * self._settings.slower for after in self._tuning.hello_starting_s)
         self.due = self._starting.popleft()
 
     @property
@@ -117,10 +90,10 @@ class Hellos:
         :param knows: it has opened a packet of this robot, so it has a hello
         """
         if knows and self._settings.slower > 1:
-            self._eager = EAGER
+            self._eager = self._tuning.hello_eager
             return
-        self._starting = deque(now + after * self._settings.slower for after in STARTING_S[1:])
-        self._eager = EAGER
+        self._starting = deque(now + after * self._settings.slower for after in self._tuning.hello_starting_s[1:])
+        self._eager = self._tuning.hello_eager
         self.answer(now)
 
     def answer(self, now: float) -> None:
@@ -134,7 +107,8 @@ class Hellos:
 
     def early(self, pause_s: float) -> float:
         """A time in s, and this one in the mean, for what nobody may hear if it comes in an exact rhythm."""
-        return pause_s * (1 - EARLY * self._rng.random()) / (1 - EARLY / 2)
+        early = self._tuning.hello_early
+        return pause_s * (1 - early * self._rng.random()) / (1 - early / 2)
 
     def urgent(self, now: float, *, idle: bool, latency: bool, heard: bool) -> bool:
         """Whether a hello goes before messages.
@@ -146,11 +120,12 @@ class Hellos:
         late = now - self.due
         if late < 0 or idle or self._answering:
             return late >= 0
+        slower, tuning = self._settings.slower, self._tuning
+        first_s = latency * tuning.hello_latency_s
         if self._starting:
-            slower = self._settings.slower
-            rests = slower > 1 and self._rests and late <= SELDOM_S * slower
-            return late >= latency * LATENCY_S and not rests
-        return late > (SELDOM_S if heard else OFTEN_S / 2) * self._settings.slower + latency * LATENCY_S
+            rests = slower > 1 and self._rests and late <= tuning.hello_seldom_s * slower
+            return late >= first_s and not rests
+        return late > (tuning.hello_seldom_s if heard else tuning.hello_often_s / 2) * slower + first_s
 
     def yielded(self) -> None:
         """A packet of messages leaves."""
@@ -187,7 +162,9 @@ class Hellos:
     @property
     def _period(self) -> float:
         """s from one hello to the next."""
-        return min(max(OFTEN_S, self._settings.packet_len / HELLO_BYTES_S), SELDOM_S) * self._settings.slower
+        settings, tuning = self._settings, self._tuning
+        often_s = max(tuning.hello_often_s, settings.packet_len / tuning.hello_bytes_s)
+        return min(often_s, tuning.hello_seldom_s) * settings.slower
 
     @property
     def _calm(self) -> bool:
@@ -196,7 +173,7 @@ class Hellos:
             self._window.peers.loss,
             *(neighbour.inbox.reports.loss for neighbour in self._neighbours.all.values() if neighbour.proven),
         ]
-        return len(losses) > 1 and max(losses) < CALM
+        return len(losses) > 1 and max(losses) < self._tuning.report_calm_loss
 
     def entries(self, room: int, now: float) -> list[Control]:
         """The entries of a hello; also sets the time of the next one.
@@ -207,15 +184,15 @@ class Hellos:
         """
         window, neighbours = self._window, self._neighbours
         wants = neighbours.unproven
-        self._answering, self._yields = False, RESTS
+        self._answering, self._yields = False, self._tuning.hello_rests
         if self._apart:
             apart, self._apart = self._apart, []
             self.due = self._next(now, wants=wants)
             return apart
         free = room - HELLO_LEN
         lone = self.lone and not self._starting
-        period = SELDOM_S * self._settings.slower if self._calm else self._period
-        self._pause = min(2 * self._pause, max(LONE_S, self._period)) if lone else period
+        period = self._tuning.hello_seldom_s * self._settings.slower if self._calm else self._period
+        self._pause = min(2 * self._pause, max(self._tuning.hello_lone_s, self._period)) if lone else period
         marks, heard = self._messages.kept.marks(now), neighbours.heard(window.packets.newest)
         proofs, self._heard = _in_turn(heard, self._heard, max(free // HEARD_LEN - bool(marks), 1))
         if free < HEARD_LEN:
@@ -239,7 +216,7 @@ class Hellos:
         if not wants or not self._eager:
             return due
         self._eager -= 1
-        return min(due, now + EAGER_S * self._settings.slower)
+        return min(due, now + self._tuning.hello_eager_s * self._settings.slower)
 
 
 def _in_turn(items: Sequence[_T], turn: int, most: int) -> tuple[list[_T], int]:

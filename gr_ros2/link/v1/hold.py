@@ -23,22 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
-OVERLAP = 1 / 2
-"""Part of a packet's airtime by which a repair may delay a message. With a quarter, odometry at 20 % loss one way is
-17 % older at 40 Hz; with none, another 9 %."""
-SURPLUS, _MOST_OWED = 2.5, 2.0
-"""Repairs owed per packet that is expected to be lost, and at most. With 1, a sixteenth of the messages at 45 and 50 Hz
-are lost one way at 20 % loss, and odometry is 6 to 7 times as old; with 2.5 none is. With 4, it is older by a sixth at
-37.5 Hz, where a repair just fits between two messages."""
-_SMOOTHING = 1 / 8
-_LATE = 1 / 4
-"""Part of a topic's period for which its next message is waited for after its time. Where messages come at random, in
-pairs or with gaps, they are no older than if nothing waited (``python -m bench constants``)."""
-_MOST_IN_VAIN = 6
-"""Waits in vain that are counted: at most 4^5 repairs go without waiting before the next one waits. With none,
-odometry in slots is 14 % older with reports, and three times as old one way, at 20 % loss."""
-_GAIN = 1 / 16
-"""Part of a packet's airtime that a wait must gain to be worth it."""
+from gr_ros2.core.tuning import Tuning
 
 
 @dataclass(slots=True)
@@ -46,10 +31,12 @@ class Period:
     """The times at which the messages of one topic come.
 
     :param last: time in s of the newest message
+    :param smoothing: how fast the mean is learned
     :param mean: mean interval in s, 0 before the second message
     """
 
     last: float
+    smoothing: float
     mean: float = 0.0
 
     def observe(self, now: float) -> None:
@@ -59,9 +46,9 @@ class Period:
         if not self.mean:
             self.mean = interval
         elif interval < 2 * self.mean:
-            self.mean += (interval - self.mean) * _SMOOTHING
+            self.mean += (interval - self.mean) * self.smoothing
         else:  # messages are missing, or the topic has changed its rate
-            self.mean += self.mean * _SMOOTHING
+            self.mean += self.mean * self.smoothing
 
     @property
     def due(self) -> float:
@@ -72,7 +59,8 @@ class Period:
 class Hold:
     """The decision for one sender. Times are in s."""
 
-    def __init__(self) -> None:
+    def __init__(self, tuning: Tuning) -> None:
+        self._tuning = tuning
         self._periods: dict[int, Period] = {}
         self._soonest: tuple[float, float] | None = None
         """When the next message is due, and until when it is waited for; None if not known."""
@@ -89,7 +77,7 @@ class Hold:
         """Note that a message of a topic has come."""
         period = self._periods.get(topic_id)
         if period is None:
-            self._periods[topic_id] = Period(now)
+            self._periods[topic_id] = Period(now, self._tuning.hold_smoothing)
         else:
             period.observe(now)
         self._soonest = None
@@ -99,8 +87,9 @@ class Hold:
 
         :param loss: share of packets lost, as far as it is known or expected
         """
-        if self._owed < _MOST_OWED:
-            self._owed = min(self._owed + SURPLUS * loss / (1 - loss), _MOST_OWED)
+        tuning = self._tuning
+        if self._owed < tuning.hold_most_owed:
+            self._owed = min(self._owed + tuning.hold_surplus * loss / (1 - loss), tuning.hold_most_owed)
         if self._would_end < inf:
             self._ended(self._would_end - now)
 
@@ -128,7 +117,7 @@ class Hold:
         if not airtime or (repairs and self._owed >= 1):
             return now
         due, until = self._next(now)
-        if end - due <= OVERLAP * airtime:
+        if end - due <= self._tuning.hold_overlap * airtime:
             return now
         if self._would_end == inf:
             if self._in_vain > 1 and self._skipped < 4 ** (self._in_vain - 1):
@@ -141,7 +130,8 @@ class Hold:
         """Note that a wait is over, and how many s a message gained by it."""
         self._would_end = inf
         self._skipped = 0
-        self._in_vain = 0 if gained > _GAIN * self._airtime else min(self._in_vain + 1, _MOST_IN_VAIN)
+        helped = gained > self._tuning.hold_gain * self._airtime
+        self._in_vain = 0 if helped else min(self._in_vain + 1, self._tuning.hold_most_in_vain)
 
     def _next(self, now: float) -> tuple[float, float]:
         """When the next message is due, and until when it is waited for."""
@@ -149,6 +139,6 @@ class Hold:
             self._soonest = (inf, inf)
             for period in self._periods.values():
                 due = period.due
-                if due < self._soonest[0] and (until := due + _LATE * period.mean) > now:
+                if due < self._soonest[0] and (until := due + self._tuning.hold_late * period.mean) > now:
                     self._soonest = (due, until)
         return self._soonest

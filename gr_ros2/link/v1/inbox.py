@@ -137,9 +137,12 @@ class Inbox:
             patience_s=patience_s,
             incomplete=self._reassembly.oldest,
             brings=brings,
+            tuning=settings.tuning,
         )
         several = settings.radios > 1
-        self._overtaking = Overtaking(self.decoder, self.order.contents, learned or Overtaken()) if several else None
+        self._overtaking = (
+            Overtaking(self.decoder, self.order.contents, learned or Overtaken(settings.tuning)) if several else None
+        )
         of = src_id, boot
         self.reports: Reporter = (
             SharedReporter(of, self.decoder, self.order, settings, self._reassembly, tells_snr=tells_snr)

@@ -24,21 +24,6 @@ from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 from gr_ros2.wire.table import AnnouncedTopic, write_table
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
-TABLE_FIRST = 2
-"""Number of packets up to which the table of topics goes before messages."""
-SETTLING_S = 1.0
-"""s after which a latched message is named in hellos: a receiver that lacks it then has lost it, not just not received
-it yet."""
-ANSWERS, PAUSE, PAUSE_S = 3, 10, 1.0
-"""A message is sent again for robots that ask once in a pause, and up to ``ANSWERS`` times at once after a time without
-need. A pause is ``PAUSE`` times the time that the message takes on the air, and ``PAUSE_S`` s at least. So those who
-join one after the other are answered at once, and forged requests take a tenth of the time at most in the long run.
-The time that it waits does not count: three rows of a table that waited for seconds beside a backlog were refused for
-40 s then."""
-STARTING_S = 2.0
-"""s from the start during which the table is repaired even if no receiver reports; any other kept message is for so
-long beyond the time that it waited."""
-
 
 @dataclass(slots=True, eq=False)
 class _Kept:
@@ -79,7 +64,8 @@ class KeptMessages:
         admit: Callable[[SentTopic, Message], None],
     ) -> None:
         self.digest = 0
-        self._topics, self._room, self._settings = topics, room, settings
+        self._topics, self._room = topics, room
+        self._settings, self._tuning = settings, settings.tuning
         self._stats, self._admit = stats, admit
         self._kept: dict[int, list[_Kept]] = {}
         self._rows: dict[int, _Kept] = {}
@@ -156,9 +142,11 @@ class KeptMessages:
             return True
         if not self._of(topic_id):
             return True
-        pause = max(PAUSE_S * self._settings.slower, PAUSE * self._packets(topic_id) * interval_s)
-        left, at = self._answers.get(topic_id, (ANSWERS, now))
-        left = min(left + (now - at) / pause, ANSWERS)
+        tuning = self._tuning
+        air_s = self._packets(topic_id) * interval_s
+        pause = max(tuning.kept_pause_s * self._settings.slower, tuning.kept_pause * air_s)
+        left, at = self._answers.get(topic_id, (tuning.kept_answers, now))
+        left = min(left + (now - at) / pause, tuning.kept_answers)
         if left >= 1:
             left -= self._tell_anew(now) if topic_id == TABLE_TOPIC else self.ask(topic_id, now, robot)
             self._answers[topic_id] = left, now
@@ -183,7 +171,7 @@ class KeptMessages:
     def _tell_anew(self, now: float) -> bool:
         """Send all rows of the table: those that wait already, then first those of topics whose messages wait; returns
         whether there are any."""
-        self._starting_until = min(self._starting_until, now + STARTING_S * self._settings.slower)
+        self._starting_until = min(self._starting_until, now + self._tuning.kept_starting_s * self._settings.slower)
         queue = self._topics[TABLE_TOPIC].queue
         leaving = set[bytes]()
         for message in queue:
@@ -201,7 +189,7 @@ class KeptMessages:
         :param robot: which robot; what it missed of messages that were under way when it came is enough at first
         :param fills: the table takes only room that nothing else needs
         """
-        self._starting_until = min(self._starting_until, now + STARTING_S * self._settings.slower)
+        self._starting_until = min(self._starting_until, now + self._tuning.kept_starting_s * self._settings.slower)
         topic = self._topics.get(topic_id)
         if topic is None:
             return False
@@ -242,7 +230,7 @@ class KeptMessages:
     @property
     def _table_qos(self) -> int:
         # Nothing is delivered without the table. A long one does not delay urgent messages.
-        return QOS_LATENCY if self.table_packets <= TABLE_FIRST else QOS_DEFAULT
+        return QOS_LATENCY if self.table_packets <= self._tuning.table_first else QOS_DEFAULT
 
     def _send_rows(self, rows: Collection[_Kept], qos: int, now: float) -> None:
         queue = self._topics[TABLE_TOPIC].queue
@@ -280,12 +268,12 @@ class KeptMessages:
             return
         for kept in of:
             if kept.payload is message.payload:
-                settling_s = 0.0 if kept.missed else SETTLING_S * self._settings.slower
+                settling_s = 0.0 if kept.missed else self._tuning.kept_settling_s * self._settings.slower
                 kept.named = min(kept.named, now + settling_s)
                 kept.begin = message.begin if message.index > 1 else kept.begin
         if not reported:
             # Later the table is sent again, and is small; at the start, nothing can be delivered without it.
             lifetime, waited = message.lifetime, now - message.submitted
-            again = STARTING_S * self._settings.slower
+            again = self._tuning.kept_starting_s * self._settings.slower
             table = message.topic_id == TABLE_TOPIC
             lifetime.expires = self._starting_until if table else min(lifetime.expires, now + 2 * waited + again)

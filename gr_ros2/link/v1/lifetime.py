@@ -16,9 +16,6 @@ from math import inf
 from gr_ros2.link.instances import ALL, Keys, replaced
 from gr_ros2.settings.config import QueuePolicy
 
-WORTH = 0.85
-"""Part of ``hold_s`` for which a message is repaired after the next one of its topic has left, while nobody reports. A
-receiver goes on without it after ``hold_s``; what comes back later than that is of no use."""
 MOST_LIFETIMES = 4096
 """Newer messages of the same topic after which a message is not repaired any more: a bound on memory."""
 

@@ -20,17 +20,13 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from math import inf
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.gap_contents import GapContents
 from gr_ros2.wire.control import MAP
 
 _VOID = 256
 """Packets noted as left out of repairs before the notes about old ones are dropped."""
-_SMOOTHING = 1 / 16
-"""How fast the share of missing packets that come back is learned. With a quarter, messages of a sender that repairs
-nothing are 38 % younger at first, but one way at 55 Hz and 20 % loss 1.3 % of the messages are lost in addition."""
-_ANEW = 4
-"""Times ``patience_s`` for which a message may wait anew because a robot is heard."""
 _COST = 430
 """Bytes beside its payload that a message takes which waits, one that came over others with all that is known of it
 (measured with ``tracemalloc``)."""
@@ -120,7 +116,9 @@ class Order:
         patience_s: float = inf,
         incomplete: Callable[[int], tuple[int, int] | None] = nothing,
         brings: Callable[[float], bool] = nobody,
+        tuning: Tuning = Tuning(),
     ) -> None:
+        self._tuning = tuning
         self.told = False
         self.low = self.wanted = self.all_from = first
         self.held = 0
@@ -130,7 +128,7 @@ class Order:
         self.passed_on: dict[int, tuple[int, int]] = {}
         self._since: dict[int, float] = {}
         """When a message came out last in a topic in which others wait, or a robot came that may bring others, s."""
-        self.contents = GapContents(decoder, room)
+        self.contents = GapContents(decoder, room, tuning)
         self._passed: dict[int, int] = {}
         """By topic: no missing packet before this number can have carried something of it."""
         self._decoder = decoder
@@ -192,7 +190,7 @@ class Order:
         """A robot is heard, or is heard again, that may bring what is waited for. One at the edge of its range would be
         heard again and again, and bring nothing."""
         for topic_id, line in self._waiting.items():
-            if line and now < min(ready.came for ready in line) + _ANEW * self._patience_s:
+            if line and now < min(ready.came for ready in line) + self._tuning.order_anew * self._patience_s:
                 self._since[topic_id] = now
 
     def told_again(self, ready: Ready) -> bool:
@@ -352,9 +350,9 @@ class Order:
             _, first, last = gaps.popleft()
             for number in range(max(first, last + 1 - MAP), last + 1):  # earlier ones hardly count
                 if number in decoder:
-                    self._recovery += (1 - self._recovery) * _SMOOTHING
+                    self._recovery += (1 - self._recovery) * self._tuning.order_smoothing
                 elif number >= dead and number not in self._void:
-                    self._recovery -= self._recovery * _SMOOTHING
+                    self._recovery -= self._recovery * self._tuning.order_smoothing
             low = max(low, last + 1)
         if gaps and self._recovery < 0.5:
             low = max(low, gaps[-1][2] + 1)

@@ -26,7 +26,6 @@ from gr_ros2.link.queues import OVERLOAD_S, OVERLOADED, Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.kept import KeptMessages
-from gr_ros2.link.v1.lifetime import WORTH
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.packing import ENTRY, Packing
 from gr_ros2.link.v1.peers import Peers
@@ -113,6 +112,7 @@ class Outbox:
             self._left,
             boot=boot,
             room=room,
+            tuning=settings.tuning,
             shares=settings.shares,
             slow=lambda: settings.slower > 1,
         )
@@ -340,7 +340,7 @@ class Outbox:
             policy=topic.queue.policy,
             depth=topic.publishers.depth,
             reported=reported,
-            waited_for=inf if message.repeat else now + WORTH * self._settings.hold_s,
+            waited_for=inf if message.repeat else now + self._settings.tuning.repair_worth * self._settings.hold_s,
         )
         if message.key:
             topic.lifetimes.restart(message.keys)

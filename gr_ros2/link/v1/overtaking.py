@@ -6,7 +6,8 @@ after a later one. So a message waits while a packet before it is missing that m
 packets lately took, and only while some are. What is of no use when it is old (a command) does not wait. Nor is a
 packet lost before that time: of two radios that lose nothing, 16 to 33 % counted as lost otherwise.
 
-Invariants: messages of one topic come out in the order in which they began; none waits for longer than ``MOST_S``.
+Invariants: messages of one topic come out in the order in which they began; none waits for longer than
+``overtaken_most_s``.
 """
 
 from __future__ import annotations
@@ -14,41 +15,35 @@ from __future__ import annotations
 from collections import deque
 from math import inf
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.gap_contents import GapContents
 from gr_ros2.link.v1.order import Ready
-
-MOST_S = 0.02
-"""s for which a message waits at most; what comes later has not been overtaken."""
-SOME = 0.01
-"""Share of packets that are overtaken from which on messages wait."""
-_SHARE_WEIGHT, _TIME_WEIGHT = 1 / 64, 1 / 16
-"""Weight of the newest packet in that share, and of the newest that was overtaken in how late these are."""
-_TIMES = 4
-"""How much longer than the mean of these is waited: 95 % have come then."""
 
 
 class Overtaken:
     """How many packets of a robot are overtaken, and how late these are. It is kept when the robot restarts: else about
     ten messages of the new start were overtaken before any waited."""
 
-    def __init__(self) -> None:
-        self._share, self._late_s = 0.0, MOST_S / _TIMES
+    def __init__(self, tuning: Tuning) -> None:
+        self.tuning = tuning
+        self._share, self._late_s = 0.0, tuning.overtaken_most_s / tuning.overtaken_times
 
     @property
     def wait_s(self) -> float:
         """s for which a missing packet is waited for now."""
-        return min(_TIMES * self._late_s, MOST_S) if self._share >= SOME else 0.0
+        most_s = min(self.tuning.overtaken_times * self._late_s, self.tuning.overtaken_most_s)
+        return most_s if self._share >= self.tuning.overtaken_some else 0.0
 
     def came(self, late_s: float) -> None:
         """A packet has come.
 
         :param late_s: s since later ones have; infinite where it is the newest
         """
-        overtaken = late_s <= MOST_S
-        self._share += (overtaken - self._share) * _SHARE_WEIGHT
+        overtaken = late_s <= self.tuning.overtaken_most_s
+        self._share += (overtaken - self._share) * self.tuning.overtaken_share_weight
         if overtaken:
-            self._late_s += (late_s - self._late_s) * _TIME_WEIGHT
+            self._late_s += (late_s - self._late_s) * self.tuning.overtaken_time_weight
 
 
 class Overtaking:
@@ -62,14 +57,14 @@ class Overtaking:
     def __init__(self, decoder: RepairDecoder, contents: GapContents, learned: Overtaken) -> None:
         self._decoder, self._contents, self._learned = decoder, contents, learned
         self._gaps: deque[tuple[float, int, int]] = deque()
-        """Packets that were missed no longer than ``MOST_S`` ago: when (s), the first and the last of them."""
+        """Packets that were missed in the last ``overtaken_most_s``: when (s), the first and the last of them."""
         self._untold: deque[tuple[float, int, int]] = deque()
         """Those of them of which it is not told yet whether they are lost."""
         self._waiting: list[Ready] = []
 
     def missing(self, now: float, first: int, last: int) -> None:
         """These packets had not come when a later one did."""
-        while self._gaps and self._gaps[0][0] + MOST_S < now:
+        while self._gaps and self._gaps[0][0] + self._learned.tuning.overtaken_most_s < now:
             self._gaps.popleft()
         self._gaps.append((now, first, last))
         self._untold.append((now, first, last))

@@ -1,12 +1,13 @@
 """What of the waiting messages goes into the next packet.
 
-*Order.* Messages of class latency go first, then default, then bulk. Within a class, messages of more than ``LONG``
-packets go last. Of the others the message with the largest value per byte sent goes first, ``weight * g^2 / c`` (see
-``freshness``). Every ``TURN``-th packet begins with the topic whose last turn is longest ago, so that no topic starves.
+*Order.* Messages of class latency go first, then default, then bulk. Within a class, messages of more than
+``long_packets`` go last. Of the others the message with the largest value per byte sent goes first, ``weight * g^2 /
+c`` (see ``freshness``). Every ``turn_every``-th packet begins with the topic whose last turn is longest ago, so that no
+topic starves.
 
-*Ages.* A message that has waited for more than one part in ``TOLD`` of the time for which it is of use is followed by
-its age (``Waited``), behind all messages of the packet. So who hears it, and who gets it over others, counts from when
-it was made.
+*Ages.* A message that has waited for more than one part in ``age_part`` of the time for which it is of use is followed
+by its age (``Waited``), behind all messages of the packet. So who hears it, and who gets it over others, counts from
+when it was made.
 
 *Robots that hear at different rates.* Of all pairs of a message and an MCS the one with the largest value per airtime
 leads, see ``audiences``; what goes along in its packet is for the same robots.
@@ -24,6 +25,7 @@ from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from math import inf
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.events import SentEntry
 from gr_ros2.link.key import Key
 from gr_ros2.link.stats import SenderStats
@@ -38,17 +40,6 @@ from gr_ros2.wire.ages import AGE_STEP_S, age_code
 from gr_ros2.wire.control import WAITED_LEN, Waited
 from gr_ros2.wire.v1 import TABLE_TOPIC, EntryV1, Part, fit
 
-FULL_PART = 2
-"""A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
-lost with any of them. With smaller fragments (3), the scans of ``six-topics-paced`` are 3 % younger without loss, and
-16 % older at 20 % loss. A message of class latency uses any space that is free."""
-LONG = 64
-"""A message of more packets goes after all others of its class, into the room that these leave. Odometry at 35 Hz
-beside 1 MB is then 1.05 times as old as without it; by value alone 1.4 times, because the last 60 kB go before it."""
-TOLD = 8
-"""One part in this many of the time for which a message is of use may pass at its origin without being told. Commands
-of four robots in a line with slots of 13 ms then have an age in 36 % of the packets, all of which together are 2 %
-longer; with 4 in 2 %, with 16 in 65 % (4 %). If it were always told, they would be 6 % longer."""
 ENTRY = 3
 """Bytes that an entry takes beside its payload, at least."""
 
@@ -90,16 +81,18 @@ class Packing:
         *,
         boot: int,
         room: int,
+        tuning: Tuning,
         shares: bool = False,
         slow: Callable[[], bool] = lambda: False,
     ) -> None:
-        self.turns = Turns()
+        self._tuning = tuning
+        self.turns = Turns(tuning)
         self._audience: Audience | None = None
         """For whom the packet is that is being filled; None for all."""
         self._topics, self._stats, self._left = topics, stats, left
         self._boot = boot
         self._shares, self._slow = shares, slow
-        self.short = (1 if shares else LONG) * room
+        self.short = (1 if shares else self._tuning.long_packets) * room
         """Bytes of a message above which others go before it."""
         self._open: dict[int, Sequence[Message]] = {}
         """Messages that may continue or start now, by topic."""
@@ -140,7 +133,7 @@ class Packing:
                 told = ages.ljust(len(picks), b"\0") + bytes((age,))
             free = room - used - (_size(told) if told else 0)
             taken, size = fit(free, remaining, back, message.offset)
-            if taken < 0 or not (taken == remaining or _may_cut(message, taken, used, room)):
+            if taken < 0 or not (taken == remaining or self._may_cut(message, taken, used, room)):
                 continue
             picks.append((message, taken, back))
             used, ages = used + size, told
@@ -158,6 +151,12 @@ class Packing:
             return None
         return self._take(picks, number, used, ages, now, audiences=audiences)
 
+    def _may_cut(self, message: Message, taken: int, used: int, room: int) -> bool:
+        """Whether a fragment of this many bytes is worth its header. A message that fits one packet is not cut."""
+        if not used or message.qos == QOS_LATENCY:
+            return True
+        return taken >= room // self._tuning.fragment_part and (message.started or message.remaining > room)
+
     def _age(self, message: Message, now: float) -> int:
         """The code of the age that is told of a message which may begin in this packet; 0 where it is not told."""
         if message.index:
@@ -166,7 +165,7 @@ class Packing:
         if waited_s <= AGE_STEP_S:
             return 0
         limit_s = min(self._topics[message.topic_id].limit_s, message.submitted + message.lifespan_s - made)
-        return age_code(waited_s) if waited_s > limit_s / TOLD else 0
+        return age_code(waited_s) if waited_s > limit_s / self._tuning.age_part else 0
 
     def next_timeout(self, now: float) -> float:
         """When ``fill`` may have something, s; inf if nothing waits. What ``fills`` does not count."""
@@ -335,10 +334,3 @@ class Packing:
 def _size(ages: bytes) -> int:
     """Bytes that ages take behind the last message, which then needs its length."""
     return WAITED_LEN + len(ages) + 1
-
-
-def _may_cut(message: Message, taken: int, used: int, room: int) -> bool:
-    """Whether a fragment of this many bytes is worth its header. A message that fits one packet is not cut."""
-    if not used or message.qos == QOS_LATENCY:
-        return True
-    return taken >= room // FULL_PART and (message.started or message.remaining > room)

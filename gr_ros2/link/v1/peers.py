@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf, ldexp
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.receipts import Receipts
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
@@ -21,42 +22,21 @@ from gr_ros2.wire.v1 import MAX_WINDOW
 
 START = 64
 """If a robot is first heard within this number of packets of its start, its packets count from its start on."""
-UNDER_WAY_S = 1e-3
-"""s for which a packet or a repair is under way at least. Without it, a sender with no pace would repair without end
-where a report comes at once."""
 REACH = MAX_WINDOW - 2
 """How many packets before the last one that a peer may take for a replay a combination brings back, which stands at a
 later number. A peer needs no older ones."""
-PROMPT = 1 / 64
-"""Share of packets lost from which on a peer reports every packet at once, if that takes no slot from anything. The
-sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet. With
-twice as much, odometry at 1 % loss takes 29 % fewer reports, but its p99 at 5 % loss is 8 % longer."""
-_DELAYS = 16
-"""Newest times of reports from which the shortest and the longest are taken. Without the shortest, packets are repaired
-whose reports are under way: odometry takes 38 % more packets where reports take eight slots."""
 _TIMES = 512
-_INTERVAL_S = 0.1
-"""s between two reports of a peer, until its reports tell. With 0, a sender repairs packets before the first report can
-come: three of 141 on ``paper-ofdm-paced`` without losses."""
-_SILENCE = 8
-"""Part of the time without a report for which a repair counts as under way. A message every .5 s to a robot that does
-not hear takes 623 packets a minute (4,241 without this, 396 with 4, 278 with 2). With 4, a single message at 60 % loss
-takes 1.4 s instead of .9 s in the mean; with 2, one per second at 40 % loss is 48 ms old instead of 38."""
-_LATER = 1.25
-"""Times the longest time between two reports of late for which a peer that loses nothing may keep the next one back:
-that time grows by a tenth with each report."""
-_SOON = 2
-"""Mean times between two new packets within which a report must come to be waited for. Where reports take eight slots
-at 20 % loss both ways, odometry is 14 % older without it; where they come at once or take 20 slots, it changes nothing
-(``python -m bench constants``). With 1, odometry beside 1 MB at 20 % loss is 4 to 22 % older."""
 
 
 @dataclass(slots=True, eq=False)
 class Peer:
     """What is known from the reports of one peer."""
 
+    tuning: Tuning
     bit: int
     heard: float
+    interval: float
+    """Mean time in s until it reports, while there is something to report and it loses something."""
     loss: float = 0.0
     joins: bool = True
     """Whether it has not reported since it came, or came back."""
@@ -65,8 +45,6 @@ class Peer:
     """It may take packets up to this number for replays. A combination that stands at a later one brings them back."""
     settled: int = 0
     """It needs no packet before this number."""
-    interval: float = _INTERVAL_S
-    """Mean time in s until it reports, while there is something to report and it loses something."""
     calm: float = 0.0
     """Longest time in s of late between two reports, while there is something to report and it loses nothing."""
     reports_soon: bool = False
@@ -77,8 +55,8 @@ class Peer:
     """The oldest packet that reports miss and that the sender does not repair any more; -1 for none."""
     waits_since: float = inf
     """Time in s since which reports miss such packets."""
-    delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
-    answers: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
+    delays: deque[float] = field(init=False)
+    answers: deque[float] = field(init=False)
     """Times in s from the departure of packets that were sent once to the report that covers them."""
     lost: set[int] = field(default_factory=set)
     urgent: list[tuple[bool, int]] = field(default_factory=list)
@@ -94,6 +72,10 @@ class Peer:
     """Repairs that have left since its last report."""
     has: dict[int, tuple[int, int]] = field(default_factory=dict)
     """By topic: it has all messages up to this one, as it says."""
+
+    def __post_init__(self) -> None:
+        self.delays = deque(maxlen=self.tuning.peer_delays)
+        self.answers = deque(maxlen=self.tuning.peer_delays)
 
     @property
     def delay(self) -> float:
@@ -111,12 +93,12 @@ class Peer:
     def under_way(self, now: float) -> float:
         """Time in s for which a repair may be on its way; ever longer where no report follows. Otherwise a robot that
         is heard and does not hear would have all air that is free for as long as it is there."""
-        return max(self.answer, UNDER_WAY_S, (now - self.asked) / _SILENCE)
+        return max(self.answer, self.tuning.peer_under_way_s, (now - self.asked) / self.tuning.peer_silence)
 
     @property
     def patience(self) -> float:
         """Time in s after which a packet that no report covers counts as lost, with ``doubt``."""
-        return max(self.answer if self.reports_soon else 2 * self.answer, UNDER_WAY_S)
+        return max(self.answer if self.reports_soon else 2 * self.answer, self.tuning.peer_under_way_s)
 
     @property
     def doubt(self) -> float:
@@ -130,7 +112,7 @@ class Peer:
         A peer that loses nothing reports the first packet after a rest at once, and keeps the report about those that
         follow back. What had arrived before a report left is in that report.
         """
-        return self.patience, self.heard - self.delay, self.heard + _LATER * self.calm
+        return self.patience, self.heard - self.delay, self.heard + self.tuning.peer_later * self.calm
 
 
 class Peers:
@@ -156,10 +138,17 @@ class Peers:
     """
 
     def __init__(
-        self, packets: SentPackets, unreported: Unreported, shared: SharedRepairs | None = None, *, slower: float = 1.0
+        self,
+        packets: SentPackets,
+        unreported: Unreported,
+        tuning: Tuning,
+        shared: SharedRepairs | None = None,
+        *,
+        slower: float = 1.0,
     ) -> None:
+        self._tuning = tuning
         self.all: dict[int, Peer] = {}
-        self._interval = _INTERVAL_S * slower
+        self._interval = self._tuning.peer_interval_s * slower
         self._away: dict[int, Peer] = {}
         self.loss = unreported.loss
         self.proven, self.provens = 0, [0]
@@ -217,7 +206,7 @@ class Peers:
                 peer.heard = now
             else:
                 free = next(bit for bit in range(256) if not (packets.everybody | packets.away) >> bit & 1)
-                peer = Peer(1 << free, now, interval=self._interval)
+                peer = Peer(self._tuning, 1 << free, now, self._interval)
             self.all[src_id], peer.joins = peer, True
             packets.here(peer.bit)
             self._note()
@@ -481,17 +470,17 @@ class Peers:
         if sent_at is not None and number > peer.newest:  # a report that is repeated says nothing about the way
             took = now - sent_at
             peer.roughs = 0 if once else peer.roughs + 1
-            if peer.roughs > _DELAYS:
+            if peer.roughs > self._tuning.peer_delays:
                 peer.delays.clear()
             if once or (peer.delays and took < peer.delay):
                 peer.delays.append(took)
             else:
-                peer.rough = min(peer.rough, took) if peer.roughs % _DELAYS else took
-            if loss >= PROMPT and once:
+                peer.rough = min(peer.rough, took) if peer.roughs % self._tuning.peer_delays else took
+            if loss >= self._tuning.report_prompt_loss and once:
                 peer.answers.append(took)
         peer.newest = max(peer.newest, number)
-        soon = bool(peer.answers) and max(peer.answers) <= _SOON * self._period
-        peer.reports_soon = loss >= PROMPT and soon
+        soon = bool(peer.answers) and max(peer.answers) <= self._tuning.peer_soon * self._period
+        peer.reports_soon = loss >= self._tuning.report_prompt_loss and soon
 
 
 def _turn(peer: Peer) -> int:

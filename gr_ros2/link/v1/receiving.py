@@ -126,6 +126,7 @@ class ReceivingSide:
                 packet_len=settings.packet_len,
                 repairs=settings.repair != "off",
                 most=settings.max_source_bytes,
+                tuning=settings.tuning,
             )
         self._now = -inf
         self._sender: Neighbour | None = None
@@ -400,7 +401,7 @@ class ReceivingSide:
             self._settings,
             decoder_for=self._decoder_for,
             marks=self._marks.setdefault(src_id, {}),
-            learned=self._learned.setdefault(src_id, Overtaken()),
+            learned=self._learned.setdefault(src_id, Overtaken(self._settings.tuning)),
             outcomes=self._outcomes,
             control=self._entry,
             relaying=self.relaying,

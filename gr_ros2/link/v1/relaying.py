@@ -2,7 +2,7 @@
 
 A robot that is not heard directly is *far*: its table of topics and its messages come over others. The table travels
 like a message, as topic 240 of its origin behind the full boot number; whoever hears the origin itself sends it on
-under the number that the origin has reached, again every ``TABLE_S``, one of several packets more seldom.
+under the number that the origin has reached, again every ``relay_table_s``, one of several packets more seldom.
 
 Messages of reliable topics for one robot, and calls, are carried to it (``custody``). Of reliable topics for all, all
 messages are relayed to those who do not hear their origin, in their order, once they have come out here
@@ -24,6 +24,7 @@ from collections.abc import Callable
 from math import inf
 
 from gr_ros2.core.errors import WireError
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.message_codec import FRAME
 from gr_ros2.link.v1.arriving import ArrivingMessages
 from gr_ros2.link.v1.custody import Custody
@@ -38,7 +39,7 @@ from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sent_on import REPAIRED_S, SentOn, ToPass
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, RELAYED
 from gr_ros2.link.v1.sequences import Sequences
-from gr_ros2.relay.gain import TOLD, Gains, Stream
+from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.relay.in_order import Kept, Name
 from gr_ros2.relay.memory import Memory
 from gr_ros2.relay.robots import QUIET_S, OtherRobots
@@ -58,12 +59,6 @@ from gr_ros2.wire.relayed import (
 from gr_ros2.wire.table import write_table
 from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, TABLE_TOPIC
 
-TABLE_S = 5.0
-"""s after which the table of a robot that is heard is worth sending on again: some may have come since."""
-LATER, MOST_TABLE_S = 2, REPAIRED_S
-"""A table of several packets is worth it so many times later for each of them, and not later than so many s. With
-packets of 64 bytes, sealed, one of four topics takes 14: every 5 s, tables of robots that are known left no time for
-that of another one over a line of four."""
 _BOOT_LEN = 8
 
 
@@ -98,13 +93,15 @@ class Relaying:
         packet_len: int,
         repairs: bool,
         most: int,
+        tuning: Tuning,
     ) -> None:
+        self._tuning = tuning
         self.src_id, self._robots, self._packet_len = src_id, robots, packet_len
         self._neighbours, self._outcomes, self._dropped = neighbours, outcomes, outcomes.stats.dropped
-        self.gains, self.routes = Gains(src_id, robots), Routes(robots)
+        self.gains, self.routes = Gains(src_id, robots, tuning), Routes(robots)
         self.memory = Memory(most, kinds=5)
         self.far = FarRobots(robots, neighbours, outcomes, self.routes, make_inbox, share=self.memory.share())
-        self.sent_on = SentOn(self.gains, self._dropped, self.memory, repairs=repairs)
+        self.sent_on = SentOn(self.gains, self._dropped, self.memory, tuning, repairs=repairs)
         self._telling = deque[Stream | None]()
         """What is told next: a reliable topic for all, or None for the newest message of the next of the others."""
         self._swept = 0.0
@@ -127,10 +124,11 @@ class Relaying:
         boot, table, at = self._tables.get(src_id, (0, b"", now))
         if neighbour is not None and not neighbour.hello.digest and boot != neighbour.boot:
             boot, table, at = neighbour.boot, write_table(()), -inf  # others learn that it is there, and where
-        every = min(TABLE_S * max(LATER * len(table) / self._packet_len, 1), MOST_TABLE_S) * self._robots.slower()
+        packets = max(self._tuning.relay_table_later * len(table) / self._packet_len, 1)
+        every = min(self._tuning.relay_table_s * packets, REPAIRED_S) * self._robots.slower()
         if table and neighbour is not None and now - at > every:
             self._table(src_id, boot, table, neighbour.inbox.newest, now)
-        if now > self._swept + TABLE_S:
+        if now > self._swept + self._tuning.relay_table_s:
             self._sweep(now)
 
     def reached(self, neighbour: Neighbour, number: int, began: float) -> None:
@@ -379,7 +377,7 @@ class Relaying:
     def tells(self, now: float) -> list[Newest]:
         """What this robot has of others' topics, in turn: of reliable topics for all, what has not come directly."""
         told: list[Newest] = []
-        for _ in range(TOLD):
+        for _ in range(self._tuning.gain_told):
             if not self._telling:
                 self._telling.extend([None] * self.gains.others)
                 self._telling.extend(self._apart(now))

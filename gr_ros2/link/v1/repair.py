@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.v1.combining import Combining, Repair
 from gr_ros2.link.v1.lifetime import Lifetime
@@ -64,14 +65,15 @@ class RepairWindow:
         proves: bool = False,
         slower: float = 1.0,
         pace: Pace | None = None,
+        tuning: Tuning = Tuning(),
     ) -> None:
         self._repair, self._pace = repair, pace
         self.packets = SentPackets(span, shares=shares)
-        self._unreported = Unreported(expected_loss, proves=proves, slower=slower)
-        self._shared = SharedRepairs(self.packets) if shares else None
-        self.peers = Peers(self.packets, self._unreported, self._shared, slower=slower)
-        self.thrift = Thrift(self.packets, self.peers)
-        self._combining = Combining(self.packets, room)
+        self._unreported = Unreported(expected_loss, tuning, proves=proves, slower=slower)
+        self._shared = SharedRepairs(self.packets, tuning) if shares else None
+        self.peers = Peers(self.packets, self._unreported, tuning, self._shared, slower=slower)
+        self.thrift = Thrift(self.packets, self.peers, tuning)
+        self._combining = Combining(self.packets, room, tuning)
         self._no_place = False
         """Whether the last combination could stand at no packet."""
 

@@ -19,20 +19,6 @@ from gr_ros2.link.v1.shared import in_a_row
 from gr_ros2.link.v1.writer import PacketWriter, SendSlot
 from gr_ros2.wire.control import LeftOut
 
-PATIENCE_S = 0.2
-"""s for which a receiver waits in vain for a packet before it is told so in front of new messages."""
-_POLL_S, _CALM_POLL_S = 0.02, 0.1
-"""s after which a thrifty sender that is in doubt checks again; the second one while no receiver loses packets."""
-
-
-MOST_AHEAD = 16
-"""Repairs in a row that go before new messages; each new packet allows ``in_a_row`` more. Without it, new messages had
-to wait for 40 s after an outage of 300 s at 10 Hz, and those that their queue had no room for were lost."""
-YIELDS = 8
-"""Times that a repair for which later messages wait lets messages of class latency go first. Where these still wait
-then, every second packet may be such a repair: with fewer, repairs could not keep up with 30 % of the packets lost, and
-with none, nothing in order came out any more. With 1, 2 % of the commands in loaded meshes came too late."""
-
 
 class RepairSlots:
     """The slots of one sender that carry repairs."""
@@ -48,7 +34,7 @@ class RepairSlots:
         audiences: Audiences | None = None,
     ) -> None:
         self._audiences = audiences
-        self._settings = settings
+        self._settings, self._tuning = settings, settings.tuning
         self._pace, self._window, self._writer, self._hold = pace, window, writer, hold
         self._waits_until = -inf
         """Time in s up to which repairs wait, because a new message is about to come; -inf to look anew."""
@@ -81,19 +67,19 @@ class RepairSlots:
         now, newest = slot.now, self._window.packets.newest
         if not packing.urgent:
             self._yielded = 0
-        elif self._yielded < YIELDS:
+        elif self._yielded < self._tuning.repair_yields:
             self._yielded += 1
             return None
         elif newest == self._repaired:
             return None
         waiting = packing.next_timeout(now) <= now
         if waiting:
-            more = (newest - self._number) * in_a_row(self._window.peers.loss)
-            self._ahead = min(self._ahead + more, MOST_AHEAD)
+            more = (newest - self._number) * in_a_row(self._window.peers.loss, self._tuning.shared_kept_up)
+            self._ahead = min(self._ahead + more, self._tuning.repair_most_ahead)
             self._number = newest
             if not self._ahead:
                 return None
-        given_up = self._window.peers.given_up(now, PATIENCE_S * self._settings.slower)
+        given_up = self._window.peers.given_up(now, self._tuning.repair_patience_s * self._settings.slower)
         if given_up < 0 or not self._window.may_tell(waiting=waiting):
             again = self._window.urgent(now)
             if again is not None:
@@ -168,10 +154,10 @@ class RepairSlots:
         """When a thrifty sender may want to repair something."""
         window, since = self._window, self._calm_since
         if not window.peers.loss:
-            return min(now + _CALM_POLL_S, window.thrift.next_doubt(since))
+            return min(now + self._tuning.repair_calm_poll_s, window.thrift.next_doubt(since))
         if since == -inf or window.packets.newest != self._calm_number:
             return now
-        return min(now + _POLL_S, window.thrift.next_doubt(since))
+        return min(now + self._tuning.repair_poll_s, window.thrift.next_doubt(since))
 
     def held(self, now: float, *, repairs: bool = True, airtime: float = 0.0) -> bool:
         """Whether what could leave now, a repair or something else, waits for a new message.

@@ -10,36 +10,15 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.requests import ASK_LEN, Requests
-from gr_ros2.link.v1.shared import KEPT_UP
 from gr_ros2.link.v1.writer import PacketWriter, SendSlot
 from gr_ros2.wire.control import MAP, REPORT_LEN
 from gr_ros2.wire.v1 import EntryV1
 
-REPORTS, AT_ONCE = 0.05, 8
-"""On a channel that many share: most of the bytes of all packets that reports take, and most reports in one packet."""
-FIRST = 4
-"""Reports that may leave at once after the start, on a slow channel. Without them, where packets take half a second,
-what each of three robots with a key has sent before another one had proven itself is missing there until a report
-comes after 15 s: all have heard each other after 37 instead of 28 s (median), nine in ten after 64 instead of 41. 2:
-31 and 62 s; 8: as 4."""
-WAITS_S = 10.0
-"""s after which a report that only confirms goes before newer ones of what is missed. Of two neighbours of which one
-always misses something, the other is never told otherwise what has arrived, and repairs it for ever."""
 LENGTH_LEN = 1
 """Bytes by which the last fragment of a packet grows when a report follows it: it cannot leave out its length then."""
 MASK_LEN = MAP // 8
 """Bytes kept free there for the mask of a repair. Without it a repair of full packets names those too that are not
 repaired any more, and who lacks one of these cannot use it. A mask of more packets than a report covers may not fit."""
-FORCED = 20
-"""Number of new packets after which a report or a request that found no room gets a packet of its own: 5 % of the
-slots. It is less where packets are lost, since of reports more are lost then, and each says of 32 packets what is
-missing: see ``_weight``."""
-
-
-def _weight(loss: float) -> float:
-    """For how many new packets one counts, by the share of packets that is lost. With 1, two robots that always had
-    full packets for each other brought 51 % of what they took at 30 % loss, and 7 % at 60 %; now 97 and 66 %."""
-    return 1 / (1 - min(loss, KEPT_UP)) ** 3
 
 
 class ReportSlots:
@@ -53,8 +32,9 @@ class ReportSlots:
         self.requests = Requests(neighbours, settings)
         self._neighbours = neighbours if settings.hears else ()
         self._writer = writer
-        self._settings, self._packet_len, self._shares = settings, settings.packet_len, settings.shares
-        self._allowed = float(FIRST * REPORT_LEN * (settings.slower > 1))
+        self._settings, self._tuning = settings, settings.tuning
+        self._packet_len, self._shares = settings.packet_len, settings.shares
+        self._allowed = float(self._tuning.shared_reports_first * REPORT_LEN * (settings.slower > 1))
         """Bytes of reports that may leave on a shared channel."""
         self._mask_len = MASK_LEN if settings.repair != "off" else 0
         self.reserved = self._mask_room = 0
@@ -75,8 +55,11 @@ class ReportSlots:
             if (self._shares or report.unreported or inbox.order.held) and report.due(now) <= now:
                 due.append(report)
         if self._shares:
-            self._allowed = min(self._allowed + REPORTS * self._packet_len, AT_ONCE * REPORT_LEN)
-            long_ago = now - WAITS_S * self._settings.slower
+            self._allowed = min(
+                self._allowed + self._tuning.shared_reports * self._packet_len,
+                self._tuning.shared_reports_at_once * REPORT_LEN,
+            )
+            long_ago = now - self._tuning.shared_report_waits_s * self._settings.slower
             due.sort(key=lambda r: (not r.lacks and r.reported_at > long_ago, r.reported_at))
             del due[int(self._allowed / REPORT_LEN) :]
             size = sum(report.size for report in due)
@@ -89,7 +72,7 @@ class ReportSlots:
     @property
     def overdue(self) -> bool:
         """Whether a report that is due, or a request, has found no room for long."""
-        return max(self._unheard, self._unasked) >= FORCED
+        return max(self._unheard, self._unasked) >= self._tuning.report_forced
 
     def next(self, now: float) -> float:
         """When a report may leave, s; inf for never."""
@@ -111,9 +94,14 @@ class ReportSlots:
                 entries.append(report.make(now))
                 self._unheard = 0
             else:
-                self._unheard += _weight(report.loss)
+                self._unheard += self._weight(report.loss)
         entries += self.requests.entries(free, now)
         self._unasked = (self._unasked + 1) * self.requests.crowded
+
+    def _weight(self, loss: float) -> float:
+        """For how many new packets one counts, by the share of packets that is lost. With 1, two robots that always had
+        full packets for each other brought 51 % of what they took at 30 % loss, and 7 % at 60 %; now 97 and 66 %."""
+        return 1 / (1 - min(loss, self._tuning.shared_kept_up)) ** 3
 
     def packet(self, due: Iterable[Reporter], slot: SendSlot) -> SentPacket | None:
         """A packet with reports, and with requests where there is room; None if there are none."""

@@ -20,41 +20,9 @@ from math import inf
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Order
-from gr_ros2.link.v1.peers import PROMPT
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.snr import SnrFilter
 from gr_ros2.wire.control import MAP, REPORT_LEN, Report, reportable
-
-_EVERY = 5
-"""Packets received from one report to the next; more while none is lost."""
-PER_ARRIVED = 16
-"""Packets that arrive for which one report before its time is allowed, because something was lost or a slot is free.
-With a report for every packet where the reverse is free, 43 % of the demo's packets were reports, and a slow computer
-had no time for messages (``python -m bench slow_computer``); now 28 % are."""
-PER_LOSS = 3
-"""Such reports for each packet that is lost. With 2.5, odometry beside a backlog at 20 % loss is 1.33 times as old as
-alone, with 3 it is 1.27 times (``python -m bench repair_backlog``)."""
-PER_VAIN = 1.5
-"""Such reports for each repair of what is here. With none, a sender without a pace sent 1,115 repairs of 70 lost
-packets, with 1.5 it sends 278. With .5, and 1 for each loss, 24 % of the demo's packets are reports, and the oldest
-topic is 1.06 s old instead of .91."""
-_MOST = 8.0
-"""Such reports that are saved up."""
-_SMOOTHING = 1 / 32
-_PAUSE_S = 0.1
-"""s after which a report is due, even about a single packet, at first and after a loss."""
-_CALM_S = 1.0
-"""The same at most. With .5, the reports of a link without losses cost as much again, and at .2 to 2 % loss messages of
-2 to 35 Hz are no younger."""
-_AGAIN_S = 0.5
-"""s after which a report is repeated while messages wait for an earlier one."""
-CALM = 1 / 128
-"""Share of lost packets up to which reports become rarer."""
-CONFIRM_S = 1.0
-"""s between two reports to a sender of which nothing is missed or heard since, on a channel that many share."""
-_SLOWER = 1.1
-"""By how much the time between two reports grows then. The sender expects reports at their recent interval, so that it
-must not grow faster."""
 
 
 class Reporter:
@@ -80,10 +48,11 @@ class Reporter:
         *,
         tells_snr: bool = True,
     ) -> None:
+        self._tuning = settings.tuning
         self.unreported = 0
         self.loss = 0.0
         self.confirms = False
-        self.snr = SnrFilter()
+        self.snr = SnrFilter(settings.tuning)
         self.tells_snr = tells_snr
         self._sender = sender
         self._decoder, self._order = decoder, order
@@ -97,14 +66,15 @@ class Reporter:
         self._missed = False
         """Whether a packet went missing since the last report."""
         self.reported_at = 0.0
-        self._pause_s = self._after(_PAUSE_S)
+        self._pause_s = self._after(self._tuning.report_pause_s)
         """s after which a report is due, where nobody else shares the channel: it does not change there."""
-        self._every = _EVERY * (4 if self._rare else 1)
+        self._every = self._tuning.report_every * (4 if self._rare else 1)
         self._most: float = self._every
         """Packets after which a report is due now; more than ``_every`` where nothing is lost."""
         self._slowly = 1.0
-        """By how much longer than ``_PAUSE_S`` the next report is put off, because nothing is lost."""
-        self._old_turn = False
+        """By how much longer than ``report_pause_s`` the next report is put off, because nothing is lost."""
+        self._made = 0
+        """Reports so far."""
 
     def arrived(self, *, late: bool) -> None:
         """Note a source packet.
@@ -113,10 +83,10 @@ class Reporter:
         """
         self.unreported += 1
         self._arrived += 1
-        if self._unspent < _MOST:
-            self._unspent = min(self._unspent + 1 / PER_ARRIVED, _MOST)
+        if self._unspent < self._tuning.report_most_saved:
+            self._unspent = min(self._unspent + 1 / self._tuning.report_per_arrived, self._tuning.report_most_saved)
         if not late:
-            self.loss -= self.loss * _SMOOTHING
+            self.loss -= self.loss * self._tuning.report_smoothing
 
     def repair(self, *, new: bool) -> None:
         """Note a repair, or word that something is not repaired any more.
@@ -132,7 +102,7 @@ class Reporter:
 
     def repaired_in_vain(self) -> None:
         """Note a repair of what is here: its sender repairs on until it is told, which costs more than a report."""
-        self._unspent = min(self._unspent + PER_VAIN, _MOST)
+        self._unspent = min(self._unspent + self._tuning.report_per_vain, self._tuning.report_most_saved)
 
     def missed(self, packets: int, *, counts: bool) -> None:
         """Note packets that have not arrived.
@@ -140,15 +110,16 @@ class Reporter:
         :param counts: whether they were lost; otherwise nobody listened
         """
         self._missed = True
-        self._unspent = min(self._unspent + PER_LOSS * min(packets, 1000), _MOST)
+        allowed = self._tuning.report_per_loss * min(packets, 1000)
+        self._unspent = min(self._unspent + allowed, self._tuning.report_most_saved)
         if counts:
-            self.loss = 1 - (1 - self.loss) * (1 - _SMOOTHING) ** min(packets, 1000)
+            self.loss = 1 - (1 - self.loss) * (1 - self._tuning.report_smoothing) ** min(packets, 1000)
 
     def due(self, now: float) -> float:
         """When the next report is due, s; infinite if there is nothing to report."""
         if not self.unreported:
             waits = self._order.held and self._order.told
-            return self.reported_at + max(_AGAIN_S, self._pause_s) if waits else inf
+            return self.reported_at + max(self._tuning.report_again_s, self._pause_s) if waits else inf
         at_once = (self._missed or (self.tells_snr and self.snr.changed)) and not self._rare and self._unspent >= 1
         if at_once or self.unreported >= self._most:
             return now
@@ -167,7 +138,7 @@ class Reporter:
     def helps(self) -> bool:
         """Whether to send a report early, in a slot that nothing else needs, so that losses are noticed sooner."""
         free = self._unspent >= 1 and not self._rare
-        return free and self.unreported > 0 and self.loss >= PROMPT
+        return free and self.unreported > 0 and self.loss >= self._tuning.report_prompt_loss
 
     @property
     def size(self) -> int:
@@ -175,9 +146,11 @@ class Reporter:
         return REPORT_LEN + (self.tells_snr and self.snr.snr_db is not None)
 
     def make(self, now: float) -> Report:
-        """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
-        calm = not self._missed and self.loss < CALM and self._arrived > MAP
-        self._slowly = min(self._slowly * _SLOWER, max(_CALM_S / self._pause_s, 1.0)) if calm else 1.0
+        """What has arrived: in the newest part and, in turn, in the oldest part with missing packets."""
+        tuning = self._tuning
+        calm = not self._missed and self.loss < tuning.report_calm_loss and self._arrived > MAP
+        slowest = max(tuning.report_calm_s / self._pause_s, 1.0)
+        self._slowly = min(self._slowly * tuning.report_slower, slowest) if calm else 1.0
         self._most = min(self._every * self._slowly, max(self._every, MAP // 2))
         self.unreported = 0
         self._missed = False
@@ -186,9 +159,9 @@ class Reporter:
         decoder, wanted = self._decoder, self._order.wanted
         newest = decoder.newest
         base = newest
-        self._old_turn = not self._old_turn
-        if self._old_turn and wanted < newest - MAP + 1:
+        if self._made % tuning.report_oldest == 0 and wanted < newest - MAP + 1:
             base = wanted + MAP - 1
+        self._made += 1
         arrived, here = 0, decoder.bodies
         for back in range(MAP):
             number = base - back
@@ -229,9 +202,9 @@ class SharedReporter(Reporter):
 
     def due(self, now: float) -> float:
         if self._order.told and self.lacks:
-            return now if self.unreported else self.reported_at + self._after(CONFIRM_S)
+            return now if self.unreported else self.reported_at + self._after(self._tuning.report_confirm_s)
         wanted = (self._order.told and self.confirms) or (self.tells_snr and self.snr.changed)
-        return self.reported_at + self._after(CONFIRM_S) if wanted and self.unreported else inf
+        return self.reported_at + self._after(self._tuning.report_confirm_s) if wanted and self.unreported else inf
 
     def make(self, now: float) -> Report:
         self.confirms = False

@@ -13,10 +13,6 @@ from gr_ros2.wire.v1 import TABLE_TOPIC
 
 ASK_LEN = 3
 """Bytes of a request for messages, without the topics."""
-ASK_S = 0.5
-"""s after which a request is repeated."""
-CHECK_S = 0.02
-"""s between two checks of what is missing."""
 
 
 class Requests:
@@ -28,7 +24,7 @@ class Requests:
 
     def __init__(self, neighbours: Iterable[Neighbour], settings: Settings) -> None:
         self.crowded = False
-        self._neighbours, self._settings = neighbours, settings
+        self._neighbours, self._settings, self._tuning = neighbours, settings, settings.tuning
         self.check_at = -inf if settings.hears else inf
         self._wanted_at = inf
         """When messages that others keep and this robot lacks are asked for, s."""
@@ -49,7 +45,7 @@ class Requests:
         found: list[Ask] = []
         if now < self.check_at:
             return found
-        self.check_at = now + CHECK_S
+        self.check_at = now + self._tuning.ask_check_s
         self.crowded, self._wanted_at = False, inf
         for neighbour in [neighbour for neighbour in self._neighbours if neighbour.proven]:
             kept, asked = self._kept(neighbour, now), neighbour.asked
@@ -62,7 +58,7 @@ class Requests:
                 room -= ASK_LEN + len(said)
                 found.append(Ask(neighbour.src_id, said))
                 neighbour.lost_frames.difference_update(said)
-                asked.update(dict.fromkeys(said, now + ASK_S * self._settings.slower))
+                asked.update(dict.fromkeys(said, now + self._tuning.ask_s * self._settings.slower))
             self._want(neighbour, kept, now)
         return found
 

@@ -40,7 +40,6 @@ from gr_ros2.link.v1.report_slots import LENGTH_LEN, ReportSlots
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.link.v1.writer import PacketWriter, SendSlot
-from gr_ros2.relay.gain import TOLD
 from gr_ros2.wire.control import (
     LEFT_OUT_LEN,
     NEWEST_LEN,
@@ -53,17 +52,6 @@ from gr_ros2.wire.control import (
     write_control,
 )
 from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC
-
-MOST_REPEATS = 32
-"""Most ``repeat_s`` from one repeat of the kept messages to the next, while nobody is heard though somebody could be:
-the time doubles with each repeat, as in Trickle (RFC 6206). A robot that comes then asks for them."""
-
-TABLE_SHARE = 0.1
-"""Part of the air that the table of topics takes at most where it follows every hello, since nobody reports. It comes
-every ``repeat_s`` in any case."""
-
-_TELLING_LEN = TOLD * NEWEST_LEN + 1
-"""Bytes in which a packet tells of messages of others, at least."""
 
 
 class SendingSide:
@@ -93,7 +81,9 @@ class SendingSide:
         rate: RateController | None = None,
         relaying: Relaying | None = None,
     ) -> None:
-        self.settings = settings
+        self.settings, self._tuning = settings, settings.tuning
+        self._telling_len = settings.tuning.gain_told * NEWEST_LEN + 1
+        """Bytes in which a packet tells of messages of others, at least."""
         self._rate, self._relaying = rate, relaying
         self._pace = pace
         self._slowness = Slowness(pace)
@@ -109,6 +99,7 @@ class SendingSide:
                 reads=neighbours.reads_left_out,
                 room=writer.room,
                 short=messages.packing.short,
+                tuning=settings.tuning,
             )
         self.repairs = RepairSlots(settings, pace, window, writer=writer, hold=hold, audiences=self._audiences)
         self.reports = ReportSlots(settings, neighbours.all.values(), writer)
@@ -152,7 +143,7 @@ class SendingSide:
             return repair
         if self._relaying is not None:
             leaves = now if slot.leave_at is None else slot.leave_at
-            self._relaying.sent_on.offer(messages.sent, now, leaves, self._writer.room - _TELLING_LEN)
+            self._relaying.sent_on.offer(messages.sent, now, leaves, self._writer.room - self._telling_len)
             self._relaying.custody.offer(now, leaves)
         if (sent := self._fill(due, slot)) is not None:
             return sent
@@ -180,7 +171,7 @@ class SendingSide:
         told: list[Newest] = []
         if self._relaying is not None:
             told = self._relaying.tells(now)
-            room -= max(_TELLING_LEN, sum(map(length_of, told)) + 1)  # an entry that fills it needs its length now
+            room -= max(self._telling_len, sum(map(length_of, told)) + 1)  # an entry that fills it needs its length now
         number = self._window.packets.newest + 1
         parts = self._audiences is not None and self._parts()
         if parts:  # who waits for what was not sent to all is told
@@ -371,7 +362,7 @@ class SendingSide:
 
     def _repeat(self, now: float) -> None:
         """Repeat the kept messages, if no robot reports that it has them."""
-        self._repeats = min(2 * self._repeats, MOST_REPEATS) if self.hellos.lone else 1
+        self._repeats = min(2 * self._repeats, self._tuning.repeat_most) if self.hellos.lone else 1
         self._plan_repeat(now)
         if not self._window.peers:
             self._messages.kept.announce(now)
@@ -394,7 +385,7 @@ class SendingSide:
         unmet = self._joins and not self.hellos.met_all
         often = starting or unmet or (now >= self._table_at and not self.hellos.lone)
         if often and (unmet or not window.peers) and kept.digest:  # no report says whether it has arrived
-            self._table_at = now + kept.table_packets * self._pace.interval / TABLE_SHARE
+            self._table_at = now + kept.table_packets * self._pace.interval / self._tuning.table_share
             if unmet:
                 kept.untold(now)
             else:

@@ -15,9 +15,10 @@ from collections.abc import Callable, Collection
 from math import inf
 from typing import NamedTuple
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import RELAYED, RELAYED_IN_ORDER, RELAYED_TABLES, SentTopic, SentTopics
-from gr_ros2.relay.gain import OWN, Gains, Stream
+from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.relay.in_order import COST, InOrder, Kept, Name
 from gr_ros2.relay.memory import Memory
 from gr_ros2.relay.quotas import Quotas
@@ -62,9 +63,9 @@ class SentOn:
     :ivar relayed: messages sent on, by origin and topic id
     """
 
-    def __init__(self, gains: Gains, dropped: Counter[str], memory: Memory, *, repairs: bool) -> None:
+    def __init__(self, gains: Gains, dropped: Counter[str], memory: Memory, tuning: Tuning, *, repairs: bool) -> None:
         self.relayed: Counter[tuple[int, int]] = Counter()
-        self.in_order = InOrder(gains, Quotas(MOST_KEPT, memory.share(), COST))
+        self.in_order = InOrder(gains, Quotas(MOST_KEPT, memory.share(), COST), tuning)
         self._gains, self._dropped, self._repairs = gains, dropped, repairs
         self._newest: dict[Stream, ToPass] = {}
         self._quotas: Quotas[Stream] = Quotas(MOST_STREAMS, memory.share(), _COST)
@@ -165,7 +166,7 @@ class SentOn:
             message.lifetime.expires = now + REPAIRED_S * self._gains.robots.slower()
         if message.topic_id in self._offered:
             stream, to_pass = self._offered.pop(message.topic_id)
-            self._gains.sent(stream, to_pass.message.number, now, 1.0 if table else OWN)
+            self._gains.sent(stream, to_pass.message.number, now, 1.0 if table else None)
             self.relayed[stream.origin, stream.topic_id] += 1
 
     def _drop(self, stream: Stream) -> None:

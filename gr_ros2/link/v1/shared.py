@@ -12,32 +12,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from math import ceil, inf
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.wire.v1 import MAX_WINDOW
 
-TOLD_TIMES = 2
-"""Mean times between two new packets for which reports may be older than what a repair has told all peers: that
-something is not repaired any more."""
-OWED = 0.5
-"""Packets expected to be lost of a message in order after which a repair follows it at once."""
-WITHIN = 64
-"""Packets of a message in order from which on its repairs do not wait for its end."""
-MOST_OWED = 2
-"""Packets expected to be lost from which on repairs do not wait for the end of a message. Where one message follows the
-other, repairs could not keep up with the losses otherwise."""
-KEPT_UP = 0.75
-"""Loss up to which repairs keep up where something new always waits. With more they would take three quarters of all
-packets in vain: beside one of four robots that loses 80 %, the others got 13 % less odometry then; now 5 %."""
 
-
-def in_a_row(loss: float) -> int:
+def in_a_row(loss: float, kept_up: float) -> int:
     """Repairs that may go before a new packet: where more than half is lost and something new always waits, with one
     nothing in order would come out any more.
 
     :param loss: share of packets that the peer with the most losses loses
+    :param kept_up: loss up to which repairs keep up
     """
-    return ceil(loss / (1 - loss)) if 0.5 < loss <= KEPT_UP else 1
+    return ceil(loss / (1 - loss)) if 0.5 < loss <= kept_up else 1
 
 
 class SharedRepairs:
@@ -46,8 +34,8 @@ class SharedRepairs:
     :param packets: what has left and may be repaired
     """
 
-    def __init__(self, packets: SentPackets) -> None:
-        self._packets = packets
+    def __init__(self, packets: SentPackets, tuning: Tuning) -> None:
+        self._packets, self._tuning = packets, tuning
         self._ordered = -1
         """The newest packet with a part of a message in order."""
         self._begun = 0
@@ -66,25 +54,25 @@ class SharedRepairs:
 
         :param loss: share of packets that the peer with the most losses loses
         """
-        self._may = in_a_row(loss)
+        self._may = in_a_row(loss, self._tuning.shared_kept_up)
         ordered = [lifetime for lifetime in lifetimes if lifetime.in_order]
         if ordered:
             self._ordered = number
             self._begun = 0 if any(lifetime.left for lifetime in ordered) else self._begun + 1
             self._going_on = [lifetime for lifetime in ordered if not lifetime.left]
-            loss = min(loss, KEPT_UP)
+            loss = min(loss, self._tuning.shared_kept_up)
             self._owed += loss / (1 - loss)
 
     @property
     def within(self) -> bool:
         """Whether messages in order go on in later packets, none has just ended, and repairs wait for that."""
-        waits = 0 < self._begun < WITHIN and self._owed < MOST_OWED
+        waits = 0 < self._begun < self._tuning.shared_within and self._owed < self._tuning.shared_most_owed
         return waits and any(lifetime.expires > -inf for lifetime in self._going_on)
 
     @property
     def due(self) -> bool:
         """Whether a repair is due that no report has called for."""
-        return self._owed >= OWED
+        return self._owed >= self._tuning.shared_owed
 
     def may_leave(self, *, idle: bool) -> bool:
         """Whether a repair may leave now.
@@ -135,7 +123,7 @@ class SharedRepairs:
 
         :param period: mean time between two new packets, s
         """
-        told = number in self._told and now < self._told_at + TOLD_TIMES * period
+        told = number in self._told and now < self._told_at + self._tuning.shared_told_times * period
         return not self.within and number < self._ordered and not told
 
 

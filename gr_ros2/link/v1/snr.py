@@ -6,13 +6,7 @@ one, the more a new packet counts: a Kalman filter whose channel noise is estima
 
 from __future__ import annotations
 
-_ERROR = 1.3
-"""Mean square of the error of an SNR that one preamble gives, dB^2, with a margin."""
-_LEAST_SHARE, _MOST_SHARE = 0.2, 0.8
-"""Limits of the share of a new packet in the smoothed SNR."""
-_SMOOTHING = 0.125
-CHANGE_DB = 1.5
-"""Change of the SNR that is reported at once."""
+from gr_ros2.core.tuning import Tuning
 
 
 class SnrFilter:
@@ -22,10 +16,11 @@ class SnrFilter:
     :ivar reported_db: the same in the last report
     """
 
-    def __init__(self) -> None:
+    def __init__(self, tuning: Tuning) -> None:
+        self._tuning = tuning
         self.snr_db: float | None = None
         self.reported_db: float | None = None
-        self._square = _ERROR
+        self._square = self._tuning.snr_error
         """Mean square of the differences of new SNRs from the smoothed one, dB^2."""
 
     def measured(self, snr_db: float) -> None:
@@ -33,13 +28,14 @@ class SnrFilter:
         if self.snr_db is None:
             self.snr_db = snr_db
         new = snr_db - self.snr_db
-        self._square += _SMOOTHING * (new * new - self._square)
-        share = min(max(1 - _ERROR / max(self._square, _ERROR), _LEAST_SHARE), _MOST_SHARE)
-        self.snr_db += share * new
+        tuning = self._tuning
+        self._square += tuning.snr_smoothing * (new * new - self._square)
+        changes = 1 - tuning.snr_error / max(self._square, tuning.snr_error)
+        self.snr_db += min(max(changes, tuning.snr_least_share), tuning.snr_most_share) * new
 
     @property
     def changed(self) -> bool:
         """Whether the SNR differs so much from the last one reported that the sender should know."""
         if self.snr_db is None:
             return False
-        return self.reported_db is None or abs(self.snr_db - self.reported_db) > CHANGE_DB
+        return self.reported_db is None or abs(self.snr_db - self.reported_db) > self._tuning.snr_change_db

@@ -11,20 +11,17 @@ from __future__ import annotations
 from collections import deque
 from math import inf
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.wire.v1 import MAX_WINDOW
-
-_ENOUGH = 0.05
-"""Expected number of lost packets that is too small for a repair. With 0, odometry takes 8 % more packets at 1 % loss
-and is no younger."""
 
 
 class Thrift:
     """The account of what is missing and what is on its way."""
 
-    def __init__(self, packets: SentPackets, peers: Peers) -> None:
-        self._packets, self._peers = packets, peers
+    def __init__(self, packets: SentPackets, peers: Peers, tuning: Tuning) -> None:
+        self._packets, self._peers, self._tuning = packets, peers, tuning
         self._flight: deque[tuple[float, int, int]] = deque()
         """When a repair left, and its window."""
 
@@ -42,16 +39,17 @@ class Thrift:
         while flight and (flight[0][0] + longest <= now or flight[0][2] < self._packets.oldest):
             flight.popleft()
         first, last = window[-1].number, window[0].number
+        enough, counts = self._tuning.repair_enough, self._tuning.repair_under_way
         under_way = [at for at, low, high in flight if low <= last and high >= first]
         if not peers:
             loss = self._peers.loss
-            return len(window) * loss > len(under_way) * (1 - loss) + _ENOUGH
+            return len(window) * loss > len(under_way) * counts * (1 - loss) + enough
         for peer in peers:
             expected = 0.0 if peer.reports_soon else peer.loss
             (patience, told, calm), doubt = peer.overdue(), peer.doubt
             bit, lost, calm_is_over = peer.bit, peer.lost, now >= calm
             since = now - peer.under_way(now)
-            coming = sum([at > since for at in under_way]) * (1 - peer.loss) + _ENOUGH
+            coming = sum([at > since for at in under_way]) * counts * (1 - peer.loss) + enough
             need = 0.0
             for record in window:
                 if not record.confirmed & bit:

@@ -11,24 +11,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import inf, sqrt
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.sent_packets import Sent
 from gr_ros2.wire.v1 import MAX_WINDOW
-
-MOST_LOSS = 0.5
-"""Loss up to which repairs are sent without reports in proportion to it."""
-
-TOGETHER = 6
-"""While all peers are out of range, each new packet allows as many repairs as are enough for this many packets, divided
-by their number: 2.0. Without a bound, an outage of 30 s beside odometry at 35 Hz took 887 kB of repairs instead of 395.
-Who hears and is not heard, at 10 and 20 % loss, gets as many messages of a topic without reliable publishers as without
-a bound, 98.7 and 97.3 % (98.7 and 98.1 %), with 20 here 98.1 and 95.7 %; messages in order are younger, since repairs
-of what it has do not go before those of what it lacks: 12 ms instead of .95 s at 35 Hz."""
-
-MEETING_S = 5.0
-"""s after the start of a robot in which it does not fall silent, where packets are taken only after a proof. Without
-it, a message that was said once at the start came never, if the hello of the other robot came after its repairs: on a
-busy computer, in one of three starts."""
 
 
 class Unreported:
@@ -39,14 +25,14 @@ class Unreported:
     :param proves: whether others take packets only after a proof, and idle slots take airtime from nobody
     """
 
-    def __init__(self, loss: float, *, proves: bool = False, slower: float = 1.0) -> None:
-        self.loss = loss
-        self._meeting_s = MEETING_S * slower
+    def __init__(self, loss: float, tuning: Tuning, *, proves: bool = False, slower: float = 1.0) -> None:
+        self.loss, self._tuning = loss, tuning
+        self._meeting_s = self._tuning.unreported_meeting_s * slower
         self._silent_from = inf if proves else -inf
         """When packets may be over, s; inf until the first one leaves."""
         self._owed = 0.0
         """Number of repairs of long messages that are due."""
-        self._allows = self._enough(TOGETHER) / TOGETHER
+        self._allows = self._enough(self._tuning.unreported_together) / self._tuning.unreported_together
         self._spare = 0.0
         """Number of repairs that may leave while all peers are out of range."""
         self._awaited = -1
@@ -67,7 +53,7 @@ class Unreported:
 
     def due(self, newest: int) -> bool:
         """Whether a repair of a long message goes before new packets."""
-        return self._owed >= 1 and newest <= self._awaited
+        return self._owed >= self._tuning.unreported_owed and newest <= self._awaited
 
     def end(self) -> None:
         """Somebody reports, or nothing is left to repair."""
@@ -89,7 +75,7 @@ class Unreported:
             if self._silent_from == inf:
                 self._silent_from = now + self._meeting_s
             return
-        share = 1 / self._enough(len(packets))
+        share = 1 / (self._tuning.unreported_enough * self._enough(len(packets)))
         for record in packets:
             record.covered += share
 
@@ -97,4 +83,4 @@ class Unreported:
         """Number of repairs after which so many packets are complete at a peer with the expected loss, all but
         surely (five standard deviations)."""
         lost = count * self.loss
-        return (lost + 5 * sqrt(lost) + 3) / (1 - min(self.loss, MOST_LOSS))
+        return (lost + 5 * sqrt(lost) + 3) / (1 - min(self.loss, self._tuning.unreported_most_loss))

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.events import Delivered, ReceiverEvent
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.order import Ready
-from gr_ros2.link.v1.packing import TOLD
 from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.relay.robots import QUIET_S
@@ -24,6 +24,8 @@ from tests.link.v1.air import SLOT_S, Robot, registry
 from tests.link.v1.test_commands import TWIST
 from tests.link.v1.test_custody import custody_of, line_of, named
 from tests.link.v1.test_relaying import Line, robot
+
+TUNING = Tuning()
 
 MODES: tuple[SealMode, ...] = ("none", "encrypt")
 COMMANDS = Registry([Topic(0, "cmd_vel", TWIST)])
@@ -105,7 +107,7 @@ def test_commands_over_hops_count_from_their_origin(mode: SealMode, loss: float)
     assert len(ages[2]) > 100
     assert len(ages[3]) > 20
     # An eighth of what it may wait is not told; and what had to be repaired counts from the next message, 0.3 s later.
-    most = COMMAND_DEADLINE_S * (1 + 1 / TOLD) + (0.3 if loss else 0.0) + 2 * SLOT_S
+    most = COMMAND_DEADLINE_S * (1 + 1 / TUNING.age_part) + (0.3 if loss else 0.0) + 2 * SLOT_S
     assert max(ages[2] + ages[3] + ages[4]) <= most
 
 

@@ -9,13 +9,12 @@ from collections.abc import Iterator
 import pytest
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, Gone, Met, Rejected
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.rate import Mcs
-from gr_ros2.link.v1.hellos import EARLY
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Seal, SealMode, subkey
-from gr_ros2.link.v1.unreported import MEETING_S
 from gr_ros2.link.v1.writer import SendSlot
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.wire.control import Ask, Report
@@ -30,6 +29,8 @@ from gr_ros2.wire.v1 import (
     write_repair_header,
 )
 from tests.link.v1.air import KEY, Air, Robot, registry
+
+TUNING = Tuning()
 
 SEALED: list[SealMode] = ["authenticate", "encrypt"]
 OTHER = bytes(32)
@@ -403,7 +404,7 @@ def test_forged_requests_take_a_share_of_the_air() -> None:
         air.run(0.1)
     assert one.end.received.dropped["asked_too_often"] > 0
     parts = [data for data in of(air, one)[sent:] if data[0] & 3 != QOS_REPAIR]
-    repeated = 60.0 / (10.0 * (1 - EARLY / 2)) * 98 * 220
+    repeated = 60.0 / (10.0 * (1 - TUNING.hello_early / 2)) * 98 * 220
     assert 4 * 20_000 < sum(map(len, parts)) < 0.17 * 60 * 75 * 220 + repeated
     late = Robot(3, packet_len=220)
     air.robots = [one, late]
@@ -498,7 +499,7 @@ def test_a_sealed_robot_that_nobody_hears_falls_silent() -> None:
     one = Robot(1, registry(), mode="encrypt")
     air = Air(one)
     one.end.messages.submit(0, b"said once", air.now)
-    air.run(MEETING_S + 2.0)
+    air.run(TUNING.unreported_meeting_s + 2.0)
     assert one.end.idle
 
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.events import SentPacket
-from gr_ros2.link.v1.hellos import LATENCY_S, SELDOM_S
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.mac import Slots
 from gr_ros2.settings.config import SendOptions
@@ -18,6 +18,8 @@ from gr_ros2.settings.registry import Registry
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 from tests.link.v1.test_relayed_reliable import Cell
 from tests.pairs import pairs
+
+TUNING = Tuning()
 
 JOY, TEXT = 0, 1
 LATENCY = SendOptions(qos="latency", queue="fifo")
@@ -101,7 +103,7 @@ def test_hellos_leave_in_time(medium: str) -> None:
     between = air(medium, one, other)
     between.run(20)
     hellos = [event.now for event in one.events if isinstance(event, SentPacket) and event.kind == "hello"]
-    assert max(after - at for at, after in pairwise(hellos)) < 2 * SELDOM_S + LATENCY_S + 0.5
+    assert max(after - at for at, after in pairwise(hellos)) < 2 * TUNING.hello_seldom_s + TUNING.hello_latency_s + 0.5
 
 
 @pytest.mark.parametrize(("medium", "mode"), list(zip(MEDIA, MODES, strict=True)))

@@ -5,9 +5,12 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.gap_contents import GapContents
 from gr_ros2.wire.v1 import Part, fit, write_body
+
+TUNING = Tuning()
 
 ROOM = 100
 SHORT, LONG = 0, 1
@@ -18,7 +21,7 @@ PACKETS = st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=2, max_
 def test_only_gaps_filled_by_a_message_are_noted(packets: list[tuple[int, bool]], begin: int) -> None:
     """Packets of a long message, with some short ones before its fragments; some packets are lost."""
     decoder = RepairDecoder(ROOM, lambda _: True, 1000)
-    contents = GapContents(decoder, ROOM)
+    contents = GapContents(decoder, ROOM, TUNING)
     offset = 0
     for index, (count, lost) in enumerate(packets):
         short = [Part(SHORT, b"short", last=True)] * count

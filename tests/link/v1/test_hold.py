@@ -8,12 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.events import SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.hold import SURPLUS, Hold, Period
+from gr_ros2.link.v1.hold import Hold, Period
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
+
+TUNING = Tuning()
 
 AIRTIME = 0.013
 PERIOD = 1 / 35
@@ -21,7 +24,7 @@ PERIOD = 1 / 35
 
 def hold(*, period: float = PERIOD, count: int = 10) -> Hold:
     """One that has seen a topic; its last message came at 0, and has left."""
-    made = Hold()
+    made = Hold(TUNING)
     for number in range(1 - count, 1):
         made.submitted(0, number * period)
     made.left(0.0, 0.0)
@@ -50,7 +53,7 @@ def test_a_message_that_does_not_come_is_not_waited_for_twice() -> None:
 
 
 def test_a_topic_of_which_one_message_has_come_is_not_waited_for() -> None:
-    made = Hold()
+    made = Hold(TUNING)
     made.submitted(0, 0.1)
     for now in (0.11, 0.15, 0.195, 0.25, 0.35):
         assert made.until(now, now + AIRTIME, AIRTIME) == now
@@ -70,7 +73,7 @@ def test_without_a_known_airtime_nothing_waits() -> None:
 
 @pytest.mark.parametrize("jitter", [0.0, 0.002])
 def test_a_period_is_learned_and_followed(jitter: float) -> None:
-    period = Period(0.0)
+    period = Period(0.0, TUNING.hold_smoothing)
     for number in range(1, 40):
         period.observe(number * 0.1 + jitter * (-1) ** number)
     assert period.due == pytest.approx(4.0, abs=0.004)
@@ -80,7 +83,7 @@ def test_a_period_is_learned_and_followed(jitter: float) -> None:
 
 
 def test_messages_that_are_missing_do_not_end_a_period() -> None:
-    period = Period(0.0)
+    period = Period(0.0, TUNING.hold_smoothing)
     for number in (*range(1, 20), *range(21, 40)):
         period.observe(number * 0.1)
     assert period.due == pytest.approx(4.0, abs=0.005)
@@ -102,7 +105,7 @@ def test_where_slots_are_fixed_waiting_is_soon_left_off() -> None:
 
 def test_messages_that_come_and_never_leave_are_not_waited_for_without_end() -> None:
     """Four topics, of which one is always due soon, and all their messages are refused."""
-    made = Hold()
+    made = Hold(TUNING)
     held: list[float] = []
     longest = 0.0
     for number in range(1, 2000):
@@ -130,7 +133,7 @@ def test_where_no_repair_fits_between_two_messages_they_leave_as_losses_call_for
         if made.until(at + AIRTIME, at + 2 * AIRTIME, AIRTIME) == at + AIRTIME:
             made.repaired(waiting=False)
             repairs += 1
-    assert repairs == pytest.approx(320 * SURPLUS * loss / (1 - loss), abs=2)
+    assert repairs == pytest.approx(320 * TUNING.hold_surplus * loss / (1 - loss), abs=2)
 
 
 _STEPS = st.lists(
@@ -141,7 +144,7 @@ _STEPS = st.lists(
 @given(_STEPS)
 def test_no_wait_is_without_end(steps: list[tuple[int, float, str]]) -> None:
     """A wait lasts two airtimes at most, whatever comes, leaves, or never leaves."""
-    made = Hold()
+    made = Hold(TUNING)
     now, since = 0.0, None
     for topic_id, after, what in steps:
         now += after

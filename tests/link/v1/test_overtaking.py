@@ -9,15 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.gap_contents import GapContents
 from gr_ros2.link.v1.order import Ready
-from gr_ros2.link.v1.overtaking import MOST_S, Overtaken, Overtaking
+from gr_ros2.link.v1.overtaking import Overtaken, Overtaking
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import registry
 from tests.link.v1.radios import LOOK_S, Radios, Station
+
+TUNING = Tuning()
 
 RATE = 12_500.0
 """Bytes/s of a radio: a packet takes up to 18 ms."""
@@ -150,7 +153,7 @@ def test_what_waits_when_its_sender_starts_anew_comes_out() -> None:
 def test_messages_come_out_once_in_order_and_soon(packets: list[tuple[float, float, bool]]) -> None:
     """Each packet, with one message, leaves some s after the one before, comes so many ms late, or does not come."""
     decoder = RepairDecoder(100, lambda _: True, 1000)
-    overtaking = Overtaking(decoder, GapContents(decoder, 100), Overtaken())
+    overtaking = Overtaking(decoder, GapContents(decoder, 100, TUNING), Overtaken(TUNING))
     left, arrivals = 0.0, []
     for number, (pause_s, late_ms, lost) in enumerate(packets):
         left += pause_s
@@ -180,7 +183,7 @@ def test_messages_come_out_once_in_order_and_soon(packets: list[tuple[float, flo
     while (due := overtaking.next_timeout()) is not None:
         settle(due)
     assert sorted(number for _, number in out) == sorted(came)
-    assert all(at - came[number] <= MOST_S + 1e-9 for at, number in out)
+    assert all(at - came[number] <= TUNING.overtaken_most_s + 1e-9 for at, number in out)
     out_at = {number: at for at, number in out}
     newest = -1
     for _, number in out:  # whoever delivers leaves out one that comes so late that nobody waited for it

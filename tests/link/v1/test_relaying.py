@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link.events import Announced, Delivered
 from gr_ros2.link.v1.sealing import SealMode
@@ -185,7 +186,7 @@ def test_a_table_that_comes_while_another_one_leaves_is_sent_on() -> None:
     gains = Gains(2, OtherRobots())
     for robot_id in (1, 3):
         gains.neighbour(robot_id, 0.0)
-    sent_on, topics = SentOn(gains, Counter(), Memory(10_000, 2), repairs=True), SentTopics(None, ())
+    sent_on, topics = SentOn(gains, Counter(), Memory(10_000, 2), Tuning(), repairs=True), SentTopics(None, ())
     topics.relay()
     queue, table = topics[RELAYED_TABLES].queue, Relayed(1, 5, 10, 0, TABLE_TOPIC, 0, b"table" * 40)
     sent_on.take(1, ToPass(table, 0.0, inf), 0.0)

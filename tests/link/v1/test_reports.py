@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.events import SentPacket
-from gr_ros2.link.v1.reports import PER_ARRIVED, PER_LOSS
 from gr_ros2.wire.control import MAP
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
+
+TUNING = Tuning()
 
 
 def kinds(robot: Robot) -> list[str]:
@@ -27,7 +29,8 @@ def test_reports_take_no_more_than_their_share(loss: float, share: float) -> Non
     heard = len(kinds(one)) - begun[0]
     reports = kinds(two).count("report") - begun[1]
     seconds = 1500 * SLOT_S
-    assert heard / (MAP / 2) < reports < heard * ((1 - loss) / PER_ARRIVED + loss * PER_LOSS) + 10 * seconds
+    allowed = (1 - loss) / TUNING.report_per_arrived + loss * TUNING.report_per_loss
+    assert heard / (MAP / 2) < reports < heard * allowed + 10 * seconds
     assert reports < share * (heard + reports)
 
 

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from bench import reliable
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.v1.combining import Repair
 from gr_ros2.link.v1.decoder import RepairDecoder, window_numbers
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -18,10 +19,11 @@ from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.order import Order
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.repair import RepairWindow
-from gr_ros2.link.v1.reports import CONFIRM_S, SharedReporter
+from gr_ros2.link.v1.reports import SharedReporter
 from gr_ros2.wire.v1 import Part
 
 ROOM = 100
+TUNING = Tuning()
 
 
 def reporter() -> tuple[SharedReporter, RepairDecoder, Reassembly]:
@@ -39,7 +41,7 @@ def test_packets_that_nobody_repairs_are_not_reported() -> None:
     reports.missed(3, counts=True)
     assert reports.due(5.0) == inf
     reports.confirm()
-    assert reports.due(5.0) == CONFIRM_S, "it was never reported"
+    assert reports.due(5.0) == TUNING.report_confirm_s, "it was never reported"
     reports.make(5.0)
     assert reports.due(5.0) == inf
 
@@ -53,7 +55,7 @@ def test_who_misses_something_reports_at_once() -> None:
     decoder.source(3, b"")
     assert reports.due(1.0) == 1.0, "it does not"
     reports.make(1.0)
-    assert reports.due(1.0) == 1.0 + CONFIRM_S, "the report may have been lost"
+    assert reports.due(1.0) == 1.0 + TUNING.report_confirm_s, "the report may have been lost"
 
 
 def window(peers: int) -> RepairWindow:

@@ -15,14 +15,16 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.events import Delivered
-from gr_ros2.link.v1.requests import ASK_S
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.wire.control import Ask
 from gr_ros2.wire.v1 import QOS_REPAIR, read_header
 from tests.link.v1.air import SLOT_S, Robot, registry
 from tests.link.v1.invariants import PacketsEnd
 from tests.packets import data_of
+
+TUNING = Tuning()
 
 _STEPS = st.lists(
     st.tuples(st.integers(0, 3), st.sampled_from([0, 5, 40, 45, 46, 47, 300, 1500]), st.floats(0, 0.3)),
@@ -129,4 +131,4 @@ def test_a_request_without_an_answer_is_repeated_in_time_though_nothing_else_lea
         assert departure is not None
         now = max(now + 0.01, departure if now >= 1.0 else now)
     assert len(asked) > 6
-    assert max(later - earlier for earlier, later in pairwise(asked)) < ASK_S + 0.05
+    assert max(later - earlier for earlier, later in pairwise(asked)) < TUNING.ask_s + 0.05

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.events import Delivered, ReceiverEvent, SentPacket
 from gr_ros2.link.v1.delivery import MAX_AGE_S
 from gr_ros2.link.v1.message import Message
-from gr_ros2.link.v1.packing import TOLD
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
@@ -24,6 +24,8 @@ from gr_ros2.wire.v1 import PacketV1
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 from tests.link.v1.test_ages import MODES, absent
 from tests.link.v1.test_relaying import Line, robot
+
+TUNING = Tuning()
 
 WITHIN_S = 4.0
 SCAN = SendOptions(queue="deadline", deadline_s=WITHIN_S)
@@ -146,7 +148,7 @@ def test_who_has_not_waited_or_is_never_too_old_says_nothing(mode: SealMode) -> 
     assert not told(sender)
     for n in range(20):
         sender.end.messages.submit(1, b"scan %d" % n, air.now)
-        air.run(WITHIN_S / TOLD - 3 * SLOT_S if n % 2 else 0.1)
+        air.run(WITHIN_S / TUNING.age_part - 3 * SLOT_S if n % 2 else 0.1)
     assert not told(sender)
 
 
@@ -280,8 +282,8 @@ def test_over_random_lines_no_message_comes_later_than_its_deadline_and_an_eight
     for event, age_s in seen:
         if event.payload not in repaired:
             limit_s = limits[event.topic_id]
-            assert age_s <= limit_s * (1 + 1 / TOLD) + AGE_STEP_S + 3 * SLOT_S
-            assert event.age_s >= age_s - max(limit_s / TOLD, AGE_STEP_S) - 3 * SLOT_S
+            assert age_s <= limit_s * (1 + 1 / TUNING.age_part) + AGE_STEP_S + 3 * SLOT_S
+            assert event.age_s >= age_s - max(limit_s / TUNING.age_part, AGE_STEP_S) - 3 * SLOT_S
 
 
 @pytest.mark.parametrize("mode", MODES)
