@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from tests.programs import ProgramProcess
 from tests.waiting import PATIENCE_S
 
 
@@ -22,7 +23,7 @@ class Spoken:
     def __init__(self, command: Sequence[str], **options: Any) -> None:
         self.said: list[str] = []
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
-        self.process: subprocess.Popen[str] = subprocess.Popen(list(command), **pipes, **options)
+        self.process: subprocess.Popen[str] = ProgramProcess(list(command), **pipes, **options)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 

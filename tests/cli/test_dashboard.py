@@ -15,6 +15,7 @@ import pytest
 from gr_ros2.cli.dashboard import parse_place
 from gr_ros2.cli.main import run
 from gr_ros2.core.errors import ConfigError
+from tests.programs import ProgramProcess, run_program
 from tests.waiting import PATIENCE_S
 
 
@@ -106,7 +107,7 @@ def test_beside_what_was_started_without(
         "link": ["link", str(config)],
     }[what]
     command = [sys.executable, "-m", "gr_ros2.cli", *started, "--duration", "600", *MEMORY]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
+    with ProgramProcess(command, stdout=subprocess.DEVNULL) as running:
         try:
             # Where a computer is busy, a page is not made within the ten seconds for which a person would wait.
             monkeypatch.setattr("gr_ros2.cli.control_socket._WAIT_S", PATIENCE_S)
@@ -130,10 +131,10 @@ def test_who_serves_it_to_the_network_is_warned_and_told_the_real_address(tmp_pa
 
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--no-report", "--duration", "1", *MEMORY]
     out = str(tmp_path / "out")
-    done = subprocess.run([*command, "--dashboard=0.0.0.0:0", "--out", out], capture_output=True, text=True)
+    done = run_program([*command, "--dashboard=0.0.0.0:0", "--out", out], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert f"live at http://{own_addresses()[0]}:" in done.stdout
     (line,) = done.stderr.splitlines()
     assert "everybody on the network can open this page" in line
-    quiet = subprocess.run([*command, "--dashboard=0", "--out", f"{out}2"], capture_output=True, text=True)
+    quiet = run_program([*command, "--dashboard=0", "--out", f"{out}2"], capture_output=True, text=True)
     assert quiet.stderr == ""

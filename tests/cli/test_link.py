@@ -19,6 +19,7 @@ from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.radio.config import load_link
 from tests.domains import free_domains
+from tests.programs import ProgramProcess
 from tests.waiting import PATIENCE_S, wait_for
 
 BETWEEN_S = 0.25
@@ -133,7 +134,7 @@ def test_two_robots_in_one_line_each(tmp_path: Path) -> None:
         command = [sys.executable, "-m", "gr_ros2.cli", "link", *options]
         environ = {**os.environ, "ROS_DOMAIN_ID": str(domains[robot - 1]), "PYTHONPATH": str(ROOT)}
         with log.open("w") as file:
-            running.append((subprocess.Popen(command, env=environ, stdout=file, stderr=file, text=True), log))
+            running.append((ProgramProcess(command, env=environ, stdout=file, stderr=file, text=True), log))
         return log
 
     def line(robot: int) -> tuple[str, ...]:

@@ -14,12 +14,13 @@ pytest.importorskip("gr_ros2.radio.audio_card", reason="needs sounddevice and li
 
 from gr_ros2.cli.sound import said
 from gr_ros2.radio.sound_check import SoundMeasured
+from tests.programs import run_program
 from tests.radio.sound_server import sound_server_or_skip
 
 
 def check(env: dict[str, str], *options: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "gr_ros2.cli", "sound", "check", *options]
-    return subprocess.run(command, env={**os.environ, **env}, capture_output=True, text=True)
+    return run_program(command, env={**os.environ, **env}, capture_output=True, text=True)
 
 
 @pytest.mark.slow

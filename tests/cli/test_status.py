@@ -22,6 +22,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.cli import main as command_line
 from tests.domains import free_ports
+from tests.programs import ProgramProcess, run_program
 from tests.waiting import PATIENCE_S, wait_for
 
 COMMAND = [sys.executable, "-m", "gr_ros2.cli"]
@@ -45,7 +46,7 @@ class Ends:
 
     def link(self, number: int, *options: str, terminal: int | None = None) -> subprocess.Popen[str]:
         with (self.folder / f"log-{number}").open("w") as log:
-            process = subprocess.Popen(
+            process = ProgramProcess(
                 [*COMMAND, "link", str(self.files[number - 1]), *options],
                 env={**self.env, "TERM": "xterm", "COLUMNS": "120", "LINES": "40"},
                 stdout=log if terminal is None else terminal,
@@ -58,7 +59,7 @@ class Ends:
     def run(self, *words: str) -> subprocess.CompletedProcess[str]:
         """What a command says and how it ends; in this process, but for another link."""
         if words[0] == "link":
-            return subprocess.run([*COMMAND, *words], env=self.env, capture_output=True, text=True, check=False)
+            return run_program([*COMMAND, *words], env=self.env, capture_output=True, text=True, check=False)
         with patch.dict(os.environ, self.env), redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
             status = command_line.run(words)
         return subprocess.CompletedProcess(words, status, out.getvalue(), err.getvalue())

@@ -25,6 +25,7 @@ from gr_ros2.cli.control_socket import ControlSocket, folder, sockets
 from gr_ros2.cli.dashboard import audience
 from gr_ros2.cli.top import Links, link_table
 from tests.cli.test_status import COMMAND, Ends, ends  # noqa: F401 - a fixture
+from tests.programs import ProgramProcess
 from tests.waiting import PATIENCE_S, wait_for
 
 
@@ -76,7 +77,7 @@ def in_a_terminal(ends: Ends) -> Iterator[tuple[subprocess.Popen[bytes], int, li
     terminal, slave = pty.openpty()
     before = termios.tcgetattr(slave)
     env = {**ends.env, "TERM": "xterm", "COLUMNS": "120", "LINES": "40"}
-    process = subprocess.Popen([*COMMAND, "top"], env=env, stdin=slave, stdout=slave, stderr=slave)
+    process = ProgramProcess([*COMMAND, "top"], env=env, stdin=slave, stdout=slave, stderr=slave)
     shown: list[str] = []
 
     def read() -> None:

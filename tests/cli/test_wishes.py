@@ -25,6 +25,7 @@ from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from tests.domains import free_domains, free_ports
 from tests.middleware.support import CUSTOM
+from tests.programs import ProgramProcess
 from tests.waiting import PATIENCE_S, wait_for
 
 COMMAND = [sys.executable, "-m", "gr_ros2.cli"]
@@ -55,7 +56,7 @@ class Fleet:
 
     def start(self, number: int) -> None:
         with (self._folder / f"log-{number}").open("a") as log:
-            self.processes[number] = subprocess.Popen(
+            self.processes[number] = ProgramProcess(
                 [*COMMAND, "link", str(self._folder / f"{number}.yaml")],
                 env=self.env,
                 stdout=log,

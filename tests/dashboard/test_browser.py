@@ -28,6 +28,7 @@ from gr_ros2.settings.files import REGISTRY_DIR
 from gr_ros2_lab.record.result import Result, read_result
 from tests.browser import FIND, Browser, needed
 from tests.domains import free_domains, free_ports
+from tests.programs import ProgramProcess
 from tests.waiting import PATIENCE_S, wait_for
 
 pytestmark = needed
@@ -150,7 +151,7 @@ def program(out: Path, port: int = 0, *more: str) -> Iterator[tuple[subprocess.P
         f"--dashboard={port}",
         *(word for one in settings for word in ("--set", one)),
     ]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = ProgramProcess(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
@@ -372,7 +373,7 @@ def test_a_live_link_shows_the_names_that_come_out_and_no_empty_card(viewer: Vie
         "diagnostics": {"period_s": 0},
     }
     command = [sys.executable, "-m", "gr_ros2.cli", "link", str(tmp_path / "one.yaml"), "--dashboard=0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = ProgramProcess(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         assert process.stdout is not None
         url = next(found[0] for line in process.stdout if (found := re.search(r"http://\S+", line)))

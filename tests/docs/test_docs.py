@@ -29,6 +29,7 @@ from gr_ros2_lab.run.scenario import load_scenario, scenario_from
 from gr_ros2_lab.study.sweep.definition import load_sweep
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands
 from tests.once import once
+from tests.programs import run_program
 from tests.radio.calling_robots import Robots
 from tests.radio.sound_server import sound_server_or_skip
 from tests.waiting import PATIENCE_S, wait_for
@@ -320,7 +321,7 @@ def ours(*arguments: str, folder: Path, home: Path | None = None) -> subprocess.
     environment["XDG_CACHE_HOME"] = str((home or folder).parent / "cache")
     environment["XDG_STATE_HOME"] = str((home or folder).parent / "state")  # a link of this process may hold its own
     command = [sys.executable, "-m", "gr_ros2.cli", *arguments]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
+    done = run_program(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, f"{' '.join(arguments)}: {done.stderr}"
     return done
 

@@ -20,6 +20,7 @@ from gr_ros2.middleware.dds import DdsMiddleware
 from tests.domains import free_domains
 from tests.e2e.support import COMMAND
 from tests.middleware.calling import ADD, Program
+from tests.programs import ProgramProcess
 from tests.waiting import wait_for
 
 CALLS = 80
@@ -120,7 +121,7 @@ class Robots:
             publish: {{topics: {{add: {{deadline_s: {DEADLINE_S}}}}}}}
             """
         )
-        link = subprocess.Popen([*COMMAND, "link", str(path)], stdout=subprocess.DEVNULL, text=True)
+        link = ProgramProcess([*COMMAND, "link", str(path)], stdout=subprocess.DEVNULL, text=True)
         self.stack.callback(link.wait)
         self.stack.callback(link.kill)
         return link

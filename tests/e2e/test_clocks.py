@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import socket
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,12 @@ from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.observe.positions import humble_types
 from gr_ros2.radio.clocks import MAGIC, SAMPLE
 from tests.e2e.links import LinkProcess, Links
+from tests.programs import ANEW
 from tests.waiting import wait_for
 
 POINT = "geometry_msgs/msg/PointStamped"
-PEER = (sys.executable, "-m", "tests.e2e.clock_peer")
+PEER = (*ANEW, "tests.e2e.clock_peer")
+"""Its clock is wrong before anything is loaded that reads it."""
 ADJUSTED_S = 1e-3
 """s by which the clock of the machine that runs the tests may be adjusted meanwhile, or read at another moment."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,6 +19,7 @@ from tests.domains import free_domains
 from tests.e2e.support import COMMAND, check_books, delivered_bag, set_options
 from tests.gr.ends import link
 from tests.middleware.support import LATCHED, Peer, same
+from tests.programs import run_program
 from tests.waiting import wait_for
 
 ODOM, GRID = "nav_msgs/msg/Odometry", "nav_msgs/msg/OccupancyGrid"
@@ -42,7 +42,7 @@ def subscriber(domain: int, topic: str, type_name: str) -> Iterator[Peer]:
 def test_the_demo_loses_a_tenth_of_its_packets_and_every_message_arrives(tmp_path: Path) -> None:
     """As it is shipped, but in simulated time: a computer that is late repairs too late."""
     out = tmp_path / "out"
-    done = subprocess.run(
+    done = run_program(
         [*COMMAND, "demo", "--set", "time=packets", "--no-report", "--out", str(out)],
         capture_output=True,
         text=True,
@@ -71,7 +71,7 @@ def test_the_demo_reaches_an_independent_subscriber_by_radio_only(tmp_path: Path
         not_sent_there = stack.enter_context(subscriber(sending, "/rx_robot_1/odom", ODOM))
         not_leaked = stack.enter_context(subscriber(receiving, "/robot_1/odom", ODOM))
         sent = stack.enter_context(subscriber(sending, "/robot_1/odom", ODOM))
-        done = subprocess.run(
+        done = run_program(
             [*COMMAND, "demo", "--duration", "4", "--pictures", "--out", str(out), *options],
             capture_output=True,
             text=True,

@@ -15,6 +15,7 @@ from gr_ros2.middleware.dds import DdsMiddleware
 from tests.domains import free_domains
 from tests.e2e.support import COMMAND, set_options
 from tests.middleware.support import CUSTOM, message
+from tests.programs import ProgramProcess
 from tests.waiting import PATIENCE_S, wait_for
 
 
@@ -43,7 +44,7 @@ def config(tmp_path: Path, domain: int) -> Path:
 
 
 def link(*arguments: str | Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
+    return ProgramProcess(
         [*COMMAND, "link", *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 

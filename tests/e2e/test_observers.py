@@ -28,6 +28,7 @@ from gr_ros2_lab.run.outcome import DELIVERED_BAG
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import Scenario, load_scenario
 from tests.e2e.support import COMMAND, check_complete
+from tests.programs import run_program
 from tests.radio.robots import ROOT, Robot, link_command
 from tests.waiting import wait_for
 
@@ -369,7 +370,7 @@ def test_a_link_whose_output_is_on_a_full_disk_goes_on(tmp_path: Path) -> None:
     )
     words = ["link", str(tmp_path / "robot.yaml"), "--duration", "0.5", "--pcap", str(tmp_path / "x.pcapng")]
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run([*COMMAND, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        done = run_program([*COMMAND, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1
     lines = done.stderr.splitlines()
     assert lines == [

@@ -14,6 +14,7 @@ import pytest
 
 from gr_ros2_lab.record.result import read_result
 from tests.e2e.support import COMMAND, check_books, delivered_bag, on_free_domains, set_options
+from tests.programs import ProgramProcess
 from tests.waiting import PATIENCE_S, wait_for
 
 
@@ -22,7 +23,7 @@ class Run:
 
     def __init__(self, *arguments: str) -> None:
         self._terminal, end = pty.openpty()
-        self.process = subprocess.Popen(
+        self.process = ProgramProcess(
             [*COMMAND, "run", *arguments],
             stdout=end,
             stderr=subprocess.PIPE,

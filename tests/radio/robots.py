@@ -15,6 +15,7 @@ from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.radio.robot_link import LinkObserver, RobotLink
 from tests.domains import domain
 from tests.middleware.support import CUSTOM, message
+from tests.programs import run_program
 from tests.waiting import wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -118,4 +119,4 @@ def link_command(
         """
     )
     command = [sys.executable, "-m", "gr_ros2.cli", "link", str(path), *options]
-    return subprocess.run(command, env=env, capture_output=True, text=True, cwd=ROOT, check=False)
+    return run_program(command, env=env, capture_output=True, text=True, cwd=ROOT, check=False)

@@ -16,7 +16,7 @@ from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
-from multiprocessing import resource_tracker
+from multiprocessing import forkserver, get_context, resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ flowgraphs that do not free theirs at their end, which has happened before."""
 
 _CONNECT_S = 15.0
 _WORKERS_S = 60.0
+_FORKS = get_context("forkserver")
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,13 @@ def local_cluster(processes: int) -> Iterator[LocalCluster]:
     A worker that is lost is replaced, however long its successor takes to start. Dask would give up both after
     ``lost-worker-timeout`` (15 s), which a busy machine exceeds, and a sweep without workers waits forever.
     """
-    with dask.config.set({"distributed.deploy.lost-worker-timeout": "365 days"}):
+    settings = {
+        "distributed.deploy.lost-worker-timeout": "365 days",
+        "distributed.worker.multiprocessing-method": _FORKS.get_start_method(),
+    }
+    with dask.config.set(settings):
         with _interrupts_ignored():
+            _load_for_workers()
             cluster = LocalCluster(
                 n_workers=processes,
                 threads_per_worker=1,
@@ -69,6 +75,21 @@ def local_cluster(processes: int) -> Iterator[LocalCluster]:
             )
         with cluster:
             yield cluster
+
+
+def _load_for_workers() -> None:
+    """Start the process that workers are forked from. It loads what each would load for a second of processor time, in
+    the environment that Dask gives to its workers: one thread for linear algebra."""
+    before = dict(os.environ)
+    os.environ.update(
+        {key: str(value) for key, value in dask.config.get("distributed.nanny.pre-spawn-environ").items()}
+    )
+    try:
+        _FORKS.set_forkserver_preload([__name__])
+        forkserver.ensure_running()
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from gr_ros2.cli.main import BAD_INPUT, FAILED, INTERRUPTED, run
 from gr_ros2_lab.study.sweep.definition import builtin_sweeps
 from tests.e2e.support import COMMAND
 from tests.lab.study.sweeps import write_sweep_file
+from tests.programs import ProgramProcess
 from tests.waiting import PATIENCE_S, wait_for
 
 
@@ -94,7 +95,7 @@ def test_a_sweep_that_is_stopped_ends_and_can_be_continued(
     tmp_path: Path, number: signal.Signals, workers: int
 ) -> None:
     path, out = write_sweep_file(tmp_path, repetitions=60), tmp_path / "out"
-    process = subprocess.Popen(
+    process = ProgramProcess(
         [*COMMAND, "sweep", str(path), "--out", str(out), "--workers", str(workers)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -21,6 +21,7 @@ from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.radio.zmq import HEADER, MAGIC, MediumClock
 from gr_ros2_lab.medium.process import MediumProcess, load_medium
 from tests.middleware.support import message
+from tests.programs import ProgramProcess
 from tests.radio.robot_process import RobotProcess
 from tests.radio.robots import RATE, ROOT, Robot
 from tests.waiting import wait_for
@@ -62,7 +63,7 @@ def medium(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Start]:
 
     def start() -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "gr_ros2.cli", "medium", str(path)]
-        begun.append(subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
+        begun.append(ProgramProcess(command, cwd=ROOT, stdout=subprocess.PIPE, text=True))
         assert begun[-1].stdout is not None
         assert "2 robots" in begun[-1].stdout.readline()
         return begun[-1]

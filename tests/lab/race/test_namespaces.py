@@ -11,6 +11,7 @@ import pytest
 from gr_ros2.core.errors import RunError
 from gr_ros2_lab.race.namespaces import Namespace, enter, inside
 from tests.lab.race.support import needs_namespaces
+from tests.programs import run_program
 
 OWN = "/proc/thread-self/ns/net"
 
@@ -66,7 +67,7 @@ def test_without_root_one_line_says_so_with_the_remedy() -> None:
     command = [sys.executable, "-m", "gr_ros2.cli", "race", "--short"]
     if os.geteuid() == 0:
         command = ["setpriv", "--bounding-set=-sys_admin", *command]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = run_program(command, capture_output=True, text=True)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert "the race needs root" in line

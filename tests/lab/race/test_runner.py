@@ -11,6 +11,7 @@ import pytest
 
 from gr_ros2_lab.race.contenders import CONTENDERS
 from tests.lab.race.support import needs_namespaces
+from tests.programs import ProgramProcess, run_program
 from tests.waiting import PATIENCE_S, wait_for
 
 pytestmark = needs_namespaces
@@ -42,7 +43,7 @@ def alive(pid: int) -> bool:
 def test_a_short_race_of_one_of_each_kind(tmp_path: Path) -> None:
     peers = ("gr-ros2", "gr-ros2-v0", "cyclone-best-effort", "zenoh-tcp")
     options = ("--peers", ",".join(peers), "--loss", "0", "--load", "50", "--duration", "2", "--out", str(tmp_path))
-    done = subprocess.run([*COMMAND, *options], capture_output=True, text=True)
+    done = run_program([*COMMAND, *options], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     values = json.loads((tmp_path / "race.json").read_text("utf-8"))
     cells = {cell["contender"]: cell for cell in values["cells"]}
@@ -69,7 +70,7 @@ def test_a_short_race_of_one_of_each_kind(tmp_path: Path) -> None:
 def test_a_short_race_of_three_robots_on_one_channel(tmp_path: Path) -> None:
     peers = ("gr-ros2", "cyclone-best-effort", "zenoh-udp")
     options = ("--robots", "3", "--peers", ",".join(peers), "--loss", "0", "--load", "50", "--duration", "1")
-    done = subprocess.run([*COMMAND, *options, "--out", str(tmp_path)], capture_output=True, text=True)
+    done = run_program([*COMMAND, *options, "--out", str(tmp_path)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     cells = {cell["contender"]: cell for cell in json.loads((tmp_path / "race.json").read_text("utf-8"))["cells"]}
     assert tuple(cells) == peers
@@ -89,7 +90,7 @@ def test_a_short_race_of_three_robots_on_one_channel(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_ctrl_c_and_sudden_death_leave_no_process(tmp_path: Path) -> None:
     for how in (signal.SIGINT, signal.SIGKILL):
-        with subprocess.Popen(
+        with ProgramProcess(
             [*COMMAND, "--peers", "zenoh-udp", "--out", str(tmp_path / how.name)],
             stderr=subprocess.PIPE,
             env={**os.environ, "TMPDIR": str(tmp_path)},

@@ -18,6 +18,7 @@ from gr_ros2_lab.run.domains import ReservedDomain, on_own_domains
 from gr_ros2_lab.run.robot_settings import RobotSettings
 from gr_ros2_lab.run.scenario import load_scenario
 from tests.domains import free_domains
+from tests.programs import ProgramProcess
 from tests.waiting import wait_for
 
 RUN = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--no-report", "--duration", "2"]
@@ -29,9 +30,7 @@ def domains(robots: Iterable[RobotSettings]) -> list[int | str]:
 
 
 def begun(out: Path, *words: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*RUN, "--out", str(out), *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    return ProgramProcess([*RUN, "--out", str(out), *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.mark.slow

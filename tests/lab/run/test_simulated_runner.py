@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from dataclasses import replace
 from math import sqrt
@@ -27,6 +26,7 @@ from gr_ros2_lab.run.outcome import DELIVERED_BAG, Outcome, Progress
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario
 from tests.e2e.support import check_books, check_complete, scenario
+from tests.programs import run_program
 
 BOTH = ("samples", "packets")
 PLAIN = ("paper.compression=true",)
@@ -64,7 +64,7 @@ def test_equal_seeds_give_equal_results_in_one_process_and_in_another(
     settings = [word for override in (f"time={time}", *NOISY) for word in ("--set", override)]
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-ofdm-paced", *settings]
     out = tmp_path / "out"
-    subprocess.run(
+    run_program(
         [*command, "--duration", "3", "--seed", "0", "--no-report", "--out", str(out)],
         check=True,
         env=os.environ,
