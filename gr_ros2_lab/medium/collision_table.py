@@ -14,9 +14,9 @@ from __future__ import annotations
 import json
 import logging
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,16 +24,16 @@ from typing import Any
 import numpy as np
 
 from gr_ros2.core.arrays import Floats
-from gr_ros2.core.errors import RunError
-from gr_ros2.core.files import replacing
 from gr_ros2.phy import Phy
 from gr_ros2.settings.config import ChannelConfig, replaced
 from gr_ros2_lab.medium.base import FixedPaths, RadioPath
-from gr_ros2_lab.medium.loss_table import BUILTIN_DIR, alone, cache_dir, named, program, setting_of
+from gr_ros2_lab.medium.loss_table import BUILTIN_DIR, alone, cache_dir, named, program, setting_of, write_rows
 from gr_ros2_lab.medium.samples import SampleMedium
 
 OFFSETS = (-0.97, -0.9, -0.75, -0.5, -0.25, -0.1, -0.04, -0.01, 0.0, 0.01, 0.04, 0.1, 0.25, 0.5, 0.75, 0.9, 0.97)
 """When the other packet begins, in lengths of the burst after the packet; at -1 and 1 they do not overlap."""
+_ALL_OFFSETS = np.array([-1.0, *OFFSETS, 1.0])
+"""With those at which nothing overlaps."""
 SIRS_DB = tuple(range(-8, 18))
 ABOVE_DB = (0.0, 1.5, 3.0, 4.5, 6.0, 9.0, 14.0, 30.0)
 """SNRs of a table, over that at which an ideal receiver gets half of the packets, dB."""
@@ -63,13 +63,13 @@ class CollisionTable:
     delivered: Floats
     edges: tuple[float, float]
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def odds(self) -> Floats:
+        """Log-odds of delivery at each point and where nothing overlaps, shape (snrs, sirs, ``_ALL_OFFSETS``)."""
         shares = (self.delivered + _SURE / 2) / (self.sent + _SURE)
         sides = np.repeat(shares[:, -1:].max(2, keepdims=True), shares.shape[1], 1)
-        whole = np.concatenate([sides, shares, sides], 2)  # at -1 and 1 nothing overlaps
-        odds = np.log(whole / (1 - whole))
-        object.__setattr__(self, "_odds", odds)
-        object.__setattr__(self, "_offsets", np.array([-1.0, *OFFSETS, 1.0]))
+        whole = np.concatenate([sides, shares, sides], 2)
+        return np.asarray(np.log(whole / (1 - whole)))
 
     def survival(self, snrs_db: Floats, sirs_db: Floats, offset: float) -> Floats:
         """Share of the packets that arrive alone which also arrive beside another one.
@@ -78,11 +78,9 @@ class CollisionTable:
         :param sirs_db: its power over that of the other one, dB, shape (n,)
         :param offset: when the other one begins, -1..1 lengths of the burst after the packet
         """
-        offsets: Floats = self._offsets  # type: ignore[attr-defined]
-        odds: Floats = self._odds  # type: ignore[attr-defined]
-        place = min(int(np.searchsorted(offsets, offset, "right")) - 1, len(offsets) - 2)
-        share = (offset - offsets[place]) / (offsets[place + 1] - offsets[place])
-        plane = odds[:, :, place] * (1 - share) + odds[:, :, place + 1] * share
+        place = min(int(np.searchsorted(_ALL_OFFSETS, offset, "right")) - 1, len(OFFSETS))
+        share = (offset - _ALL_OFFSETS[place]) / (_ALL_OFFSETS[place + 1] - _ALL_OFFSETS[place])
+        plane = self.odds[:, :, place] * (1 - share) + self.odds[:, :, place + 1] * share
         row, up = _between(snrs_db, self.snrs_db)
         column, right = _between(sirs_db, SIRS_DB)
         near = plane[row, column] * (1 - right) + plane[row, column + 1] * right
@@ -92,7 +90,7 @@ class CollisionTable:
         return np.asarray(np.minimum(beside / alone_, 1.0))
 
 
-def _between(values: Floats, grid: tuple[float, ...] | tuple[int, ...]) -> tuple[Any, Floats]:
+def _between(values: Floats, grid: Sequence[float]) -> tuple[Any, Floats]:
     """For each value the place in a grid before it, and how far it is from there to the next, 0..1."""
     at = np.interp(values, grid, range(len(grid)))
     place = np.minimum(at.astype(int), len(grid) - 2)
@@ -117,18 +115,12 @@ def collision_table(
     if table is not None or not measured:
         return table
     path = (folder or cache_dir()) / name
-    try:
-        with alone(path):
-            table = _read(path, setting)
-            if table is None:
-                _log.warning("measuring collisions of %s, %d B; kept in %s", phy.name, phy.packet_len, path)
-                table = measure(phy, channel, setting)
-                _write(table, path)
-    except OSError as error:
-        raise RunError(
-            f"{path}: the collisions measured cannot be kept ({error.strerror or error}); set XDG_CACHE_HOME to a "
-            "folder that can be written"
-        ) from error
+    with alone(path, "collisions"):
+        table = _read(path, setting)
+        if table is None:
+            _log.warning("measuring collisions of %s, %d B; kept in %s", phy.name, phy.packet_len, path)
+            table = measure(phy, channel, setting)
+            _write(table, path)
     return table
 
 
@@ -195,9 +187,7 @@ def burst_s(phy: Phy) -> float:
 
 
 def _write(table: CollisionTable, path: Path) -> None:
-    """Write a table so that it appears whole or not at all."""
     values = {
-        "program": program(),
         "setting": table.setting,
         "snrs_db": table.snrs_db,
         "sirs_db": SIRS_DB,
@@ -205,11 +195,7 @@ def _write(table: CollisionTable, path: Path) -> None:
         "sent": table.sent,
         "edges": table.edges,
     }
-    rows = [json.dumps(row) for plane in table.delivered.astype(int).tolist() for row in plane]
-    text = json.dumps(values, indent=1)[:-2] + ',\n "delivered": [\n  ' + ",\n  ".join(rows) + "\n ]\n}\n"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_rows(path, values, "delivered", [row for plane in table.delivered.astype(int).tolist() for row in plane])
 
 
 def _read(path: Path, setting: dict[str, Any]) -> CollisionTable | None:

@@ -15,7 +15,7 @@ import logging
 import math
 import os
 import random
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from functools import cache
@@ -246,21 +246,15 @@ def table_for(
     _read(BUILTIN_DIR / table.name, table)
     if _missing(table, snrs, packets):
         path = (folder or cache_dir()) / table.name
-        try:
-            with alone(path):
-                _read(path, table)
-                for snr_db in _missing(table, snrs, packets):
-                    at = "without noise" if snr_db is None else f"at {snr_db:g} dB"
-                    _log.warning(
-                        "measuring the packet loss of %s, %d B, %s; kept in %s", phy.name, phy.packet_len, at, path
-                    )
-                    table.points[snr_db] = measure(phy, replaced(channel, snr_db=snr_db), packets)
-                    write(table, path)
-        except OSError as error:
-            raise RunError(
-                f"{path}: the packet loss measured cannot be kept ({error.strerror or error}); set XDG_CACHE_HOME to a "
-                "folder that can be written"
-            ) from error
+        with alone(path, "packet loss"):
+            _read(path, table)
+            for snr_db in _missing(table, snrs, packets):
+                at = "without noise" if snr_db is None else f"at {snr_db:g} dB"
+                _log.warning(
+                    "measuring the packet loss of %s, %d B, %s; kept in %s", phy.name, phy.packet_len, at, path
+                )
+                table.points[snr_db] = measure(phy, replaced(channel, snr_db=snr_db), packets)
+                write(table, path)
     return table
 
 
@@ -273,9 +267,13 @@ def write(table: LossTable, path: Path) -> None:
     """Write a table so that it appears whole or not at all."""
     points = sorted(table.points.items(), key=lambda item: -math.inf if item[0] is None else item[0])
     rows = [[snr_db, point.sent, point.delivered, point.lost_in] for snr_db, point in points]
-    values = {"program": program(), "setting": table.setting, "columns": ["snr_db", "sent", "delivered", "lost_in"]}
+    write_rows(path, {"setting": table.setting, "columns": ["snr_db", "sent", "delivered", "lost_in"]}, "points", rows)
+
+
+def write_rows(path: Path, values: Mapping[str, Any], name: str, rows: Iterable[Sequence[Any]]) -> None:
+    """Write JSON values, and below a name one line per row, so that the file appears whole or not at all."""
     lines = ",\n  ".join(json.dumps(row) for row in rows)
-    text = json.dumps(values, indent=1)[:-2] + f',\n "points": [\n  {lines}\n ]\n}}\n'
+    text = json.dumps({"program": program(), **values}, indent=1)[:-2] + f',\n "{name}": [\n  {lines}\n ]\n}}\n'
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
@@ -313,9 +311,18 @@ def _missing(table: LossTable, snrs: set[float | None], packets: int) -> list[fl
 
 
 @contextmanager
-def alone(path: Path) -> Iterator[None]:
-    """Lock the file: this process has it for itself, and other processes wait."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.with_name(f".{path.name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+def alone(path: Path, what: str) -> Iterator[None]:
+    """Lock the file in which something measured is kept: this process has it for itself, and other processes wait.
+
+    :raises RunError: when it cannot be written there
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.with_name(f".{path.name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+    except OSError as error:
+        raise RunError(
+            f"{path}: the {what} measured cannot be kept ({error.strerror or error}); set XDG_CACHE_HOME to a folder "
+            "that can be written"
+        ) from error
