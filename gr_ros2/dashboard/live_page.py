@@ -7,7 +7,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -208,12 +208,10 @@ class LivePage:
             "age": [_small(line.age_s) for line in series],
             "queued": [_small(line.queued) for line in series],
         }
-        self._sources["error"].data = {
-            "name": [path.name for path in snapshot.paths],
-            "colour": [colour(path.colour) for path in snapshot.paths],
-            "t": [_small(path.error_t) for path in snapshot.paths],
-            "m": [_small(path.errors_m) for path in snapshot.paths],
-        }
+        self._show(
+            "error",
+            ((path.name, colour(path.colour), _small(path.error_t), _small(path.errors_m)) for path in snapshot.paths),
+        )
         air = snapshot.air
         if air is not None:
             kinds = {kind: _small(air.busy[kind] * 100) for kind in AIR_COLOURS} if air.busy else {}
@@ -230,31 +228,19 @@ class LivePage:
             "share": [_small(np.linspace(0, 1, len(topic.latency_cdf_s))) for topic in curves],
         }
 
+    def _show(self, source: str, rows: Iterable[tuple[Any, ...]]) -> None:
+        """Replace the data of a source by rows, each with a value for every column."""
+        shown, rows = self._sources[source], list(rows)
+        shown.data = {column: [row[place] for row in rows] for place, column in enumerate(shown.column_names)}
+
     def _draw_paths(self, snapshot: Snapshot) -> None:
         paths = snapshot.paths
-        names = [path.name for path in paths]
-        self._sources["sent"].data = {
-            "name": names,
-            "x": [_small(path.sent_x) for path in paths],
-            "y": [_small(path.sent_y) for path in paths],
-        }
-        self._sources["received"].data = {
-            "name": names,
-            "x": [_small(path.received_x) for path in paths],
-            "y": [_small(path.received_y) for path in paths],
-        }
+        self._show("sent", ((path.name, _small(path.sent_x), _small(path.sent_y)) for path in paths))
+        self._show("received", ((path.name, _small(path.received_x), _small(path.received_y)) for path in paths))
         pairs = [(path.truth, path.belief) for path in paths if path.truth is not None and path.belief is not None]
-        self._sources["gap"].data = {
-            "x": [[one[0], other[0]] for one, other in pairs],
-            "y": [[one[1], other[1]] for one, other in pairs],
-        }
+        self._show("gap", (([one[0], other[0]], [one[1], other[1]]) for one, other in pairs))
         ends = [(path.truth, _SENT) for path in paths] + [(path.belief, _RECEIVED) for path in paths]
-        known = [(*point, ink) for point, ink in ends if point is not None]
-        self._sources["ends"].data = {
-            "x": [end[0] for end in known],
-            "y": [end[1] for end in known],
-            "colour": [end[2] for end in known],
-        }
+        self._show("ends", ((*point, ink) for point, ink in ends if point is not None))
 
     def _draw_pictures(self, snapshot: Snapshot) -> None:
         """Pictures of cameras beside each other, and the newest map below the paths."""
@@ -262,13 +248,7 @@ class LivePage:
             views = [view for view in snapshot.pictures if view.is_map == is_map]
             views = sorted(views, key=lambda view: view.age_s)[:1] if is_map else views
             lefts = [view.place[0] for view in views] if is_map else _beside([view.place[2] for view in views])
-            self._sources[name].data = {
-                "image": [view.pixels for view in views],
-                "x": lefts,
-                "y": [view.place[1] for view in views],
-                "dw": [view.place[2] for view in views],
-                "dh": [view.place[3] for view in views],
-            }
+            self._show(name, ((view.pixels, left, *view.place[1:]) for view, left in zip(views, lefts, strict=True)))
         self._html["seen"].text = "<br>".join(escape(view.words) for view in snapshot.pictures)
 
     def _draw_team(self, team: TeamView, inks: dict[int, str]) -> None:
@@ -284,22 +264,12 @@ class LivePage:
             "robot": [float(send.robot) for send in sends],
             "colour": [OUTCOME_COLOURS[send.outcome(len(team.robots))] for send in sends],
         }
-        self._sources["places"].data = {
-            "x": [place[0] for place in team.places.values()],
-            "y": [place[1] for place in team.places.values()],
-            "colour": [inks[robot] for robot in team.places],
-            "robot": [str(robot) for robot in team.places],
-            "name": [f"robot {robot}" for robot in team.places],
-        }
+        self._show(
+            "places", ((*place, inks[robot], str(robot), f"robot {robot}") for robot, place in team.places.items())
+        )
         self._legend.visible = len(team.robots) <= _IN_LEGEND
-        known = [
-            (team.places[of], believed, inks[of]) for (_, of), believed in team.beliefs.items() if of in team.places
-        ]
-        self._sources["beliefs"].data = {
-            "x": [[there[0], believed[0]] for there, believed, _ in known],
-            "y": [[there[1], believed[1]] for there, believed, _ in known],
-            "colour": [ink for *_, ink in known],
-        }
+        known = [(team.places[of], there, inks[of]) for (_, of), there in team.beliefs.items() if of in team.places]
+        self._show("beliefs", (([place[0], there[0]], [place[1], there[1]], ink) for place, there, ink in known))
 
     def _draw_radio(self, radio: RadioView) -> None:
         symbols = np.empty(0, np.complex64) if radio.symbols is None else radio.symbols

@@ -39,10 +39,10 @@ def tiles_html(snapshot: Snapshot) -> str:
     tiles = [
         _tile("phase", phase, snapshot.name or "no run", css=f"phase {snapshot.phase} {snapshot.verdict}"),
         _tile("elapsed", time, "time"),
-        _tile("pdr", _ratio(snapshot.pdr), "delivered / sent", snapshot.pdr, f"main {snapshot.delivery}"),
-        _tile("lost", _share(snapshot.lost_now), "packets lost on the way, last 5 s", snapshot.lost_now, received),
-        _tile("oldest", _seconds(age), "age" if oldest is None else f"age of {oldest.name}, the oldest", age),
-        _tile("busy", _share(busy), "of the air used", busy),
+        _number("pdr", snapshot.pdr, "{:.3f}", "delivered / sent", f"main {snapshot.delivery}"),
+        _number("lost", snapshot.lost_now, "{:.1%}", "packets lost on the way, last 5 s", received),
+        _number("oldest", age, "{:.2f} s", "age" if oldest is None else f"age of {oldest.name}, the oldest"),
+        _number("busy", busy, "{:.1%}", "of the air used"),
     ]
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
@@ -54,39 +54,19 @@ def counters_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None)
     :param snr_db: SNR of the received packets, dB
     """
     sent_now, received_now = snapshot.packets_now
+    sent, received = (f"{snapshot.packets.get(name, 0):,} in all" for name in ("sent", "received"))
     refused = sum(count for name, count in snapshot.packets.items() if name.startswith("rejected_"))
-    ago = f", {snapshot.silent_s:.0f} s ago" if snapshot.old else ""
+    ago, old = (f", {snapshot.silent_s:.0f} s ago", "old") if snapshot.old else ("", "")
     tiles = [
-        _tile("sent", f"{snapshot.sent:,}", "messages sent", snapshot.sent),
-        _tile("delivered", f"{snapshot.delivered:,}", "delivered", snapshot.delivered),
-        _tile(
-            "packets_sent", f"{sent_now:.0f}/s", f"packets out, {snapshot.packets.get('sent', 0):,} in all", sent_now
-        ),
-        _tile(
-            "packets_received",
-            f"{received_now:.0f}/s",
-            f"packets in, {snapshot.packets.get('received', 0):,} in all",
-            received_now,
-        ),
-        _tile("refused", f"{refused:,}", "packets refused", refused),
-        _tile("backlog", "–" if backlog is None else f"{backlog:,}", "packets queued in the PHY", backlog),
-        _tile(
-            "snr",
-            "–" if snr_db is None else f"{snr_db:.1f} dB",
-            f"SNR received{ago}",
-            snr_db,
-            "old" if snapshot.old else "",
-        ),
+        _number("sent", snapshot.sent, "{:,}", "messages sent"),
+        _number("delivered", snapshot.delivered, "{:,}", "delivered"),
+        _number("packets_sent", sent_now, "{:.0f}/s", f"packets out, {sent}"),
+        _number("packets_received", received_now, "{:.0f}/s", f"packets in, {received}"),
+        _number("refused", refused, "{:,}", "packets refused"),
+        _number("backlog", backlog, "{:,}", "packets queued in the PHY"),
+        _number("snr", snr_db, "{:.1f} dB", f"SNR received{ago}", old),
     ]
     return f'<div class="tiles">{"".join([*tiles, *_repair_tiles(snapshot)])}</div>'
-
-
-def _share(value: Number) -> str:
-    return "–" if value is None else f"{value:.1%}"
-
-
-def _seconds(value: Number) -> str:
-    return "–" if value is None else f"{value:.2f} s"
 
 
 def state_text(snapshot: Snapshot) -> str:
@@ -159,15 +139,12 @@ def _repair_tiles(snapshot: Snapshot) -> list[str]:
     air = {kind: snapshot.packets[f"air_{kind}"] for kind in get_args(AirKind) if f"air_{kind}" in snapshot.packets}
     if not air:
         return []
-    repaired, given_up = snapshot.in_fate(Fate.REPAIRED), snapshot.in_fate(Fate.GIVEN_UP)
-    tiles = [
-        _tile("repaired", f"{repaired:,}", "delivered after repair", repaired),
-        _tile("given_up", f"{given_up:,}", "given up", given_up),
-    ]
     total = sum(air.values())
-    for kind, count in air.items():
-        tiles.append(_tile(f"air_{kind}", f"{count / total:.0%}", f"of packets out: {kind}", count / total))
-    return tiles
+    return [
+        _number("repaired", snapshot.in_fate(Fate.REPAIRED), "{:,}", "delivered after repair"),
+        _number("given_up", snapshot.in_fate(Fate.GIVEN_UP), "{:,}", "given up"),
+        *(_number(f"air_{kind}", n / total, "{:.0%}", f"of packets out: {kind}") for kind, n in air.items()),
+    ]
 
 
 def _tile(name: str, text: str, label: str, value: Number = None, css: str = "") -> str:
@@ -175,23 +152,21 @@ def _tile(name: str, text: str, label: str, value: Number = None, css: str = "")
     return f'<div class="tile {css}"><b data-field="{name}"{data}>{escape(text)}</b><span>{escape(label)}</span></div>'
 
 
-_Column = tuple[str, str, Callable[[TopicView], Number], Callable[[Number], str]]
+def _number(name: str, value: Number, form: str, label: str, css: str = "") -> str:
+    """A tile with a number, in a format of :meth:`str.format`."""
+    return _tile(name, _text(value, form.format), label, value, css)
 
 
-def _ratio(value: Number) -> str:
-    return "–" if value is None else f"{value:.3f}"
+def _text(value: Number, write: Callable[[float], str]) -> str:
+    return "–" if value is None else write(value)
 
 
-def _count(value: Number) -> str:
-    return "–" if value is None else f"{value:,.0f}"
+def _ms(value: float) -> str:
+    return f"{value * 1000:,.1f}" if abs(value) < 10 else f"{value * 1000:,.0f}"
 
 
-def _ms(value: Number) -> str:
-    return "–" if value is None else f"{value * 1000:,.1f}" if abs(value) < 10 else f"{value * 1000:,.0f}"
-
-
-def _s(value: Number) -> str:
-    return "–" if value is None else f"{value:.2f}"
+_Column = tuple[str, str, Callable[[TopicView], Number], Callable[[float], str]]
+_COUNT, _RATIO, _S, _METRES = "{:,.0f}".format, "{:.3f}".format, "{:.2f}".format, "{:.3f} m".format
 
 
 def _latency(name: str) -> Callable[[TopicView], Number]:
@@ -206,28 +181,28 @@ _GROUPS: tuple[tuple[str, tuple[_Column, ...]], ...] = (
     (
         "messages",
         (
-            ("sent", "sent", lambda topic: topic.sent if topic.goes else None, _count),
-            ("delivered", "delivered", lambda topic: topic.delivered if topic.comes else None, _count),
+            ("sent", "sent", lambda topic: topic.sent if topic.goes else None, _COUNT),
+            ("delivered", "delivered", lambda topic: topic.delivered if topic.comes else None, _COUNT),
         ),
     ),
     (
         "PDR",
         (
-            ("pdr", "all", lambda topic: topic.pdr, _ratio),
-            ("pdr_now", "last 5 s", lambda topic: topic.pdr_now, _ratio),
+            ("pdr", "all", lambda topic: topic.pdr, _RATIO),
+            ("pdr_now", "last 5 s", lambda topic: topic.pdr_now, _RATIO),
         ),
     ),
-    ("goodput", (("goodput_Bps", "B/s", lambda topic: topic.goodput_Bps if topic.comes else None, _count),)),
+    ("goodput", (("goodput_Bps", "B/s", lambda topic: topic.goodput_Bps if topic.comes else None, _COUNT),)),
     ("latency [ms]", tuple((f"latency_{q}", q, _latency(q), _ms) for q in ("p50", "p95", "p99", "max"))),
     (
         "age [s]",
         (
-            ("age_now", "now", lambda topic: topic.age_now_s, _s),
-            ("age_mean", "mean", lambda topic: topic.age_mean_s, _s),
-            ("age_peak", "peak", lambda topic: topic.age_peak_s, _s),
+            ("age_now", "now", lambda topic: topic.age_now_s, _S),
+            ("age_mean", "mean", lambda topic: topic.age_mean_s, _S),
+            ("age_peak", "peak", lambda topic: topic.age_peak_s, _S),
         ),
     ),
-    ("queue", (("queued", "now", lambda topic: topic.queued, _count),)),
+    ("queue", (("queued", "now", lambda topic: topic.queued, _COUNT),)),
 )
 
 
@@ -257,7 +232,7 @@ def _topic_row(topic: TopicView, fates: list[str]) -> str:
             value = read(topic)
             first = ' class="first"' if place == 0 else ""
             data = "" if value is None else f' data-value="{value!r}"'
-            cells += f'<td{first} data-field="{name}"{data}>{write(value)}</td>'
+            cells += f'<td{first} data-field="{name}"{data}>{_text(value, write)}</td>'
     bar = "".join(
         f'<i data-fate="{escape(fate)}" data-value="{count}" title="{escape(fate)}: {count}" '
         f'style="flex:{count};{_filled(fate_colour(fate))}">{count if count * 12 > topic.sent else ""}</i>'
@@ -282,18 +257,14 @@ def paths_html(snapshot: Snapshot) -> str:
     lines = []
     for path in snapshot.paths:
         topic = final.get(path.name)
-        text = [f"error now <b>{_metres(path.error_m)}</b>"]
+        text = [f"error now <b>{_text(path.error_m, _METRES)}</b>"]
         if topic is not None and topic.path_error_m is not None:
             text = [
-                f"path error <b>{_metres(topic.path_error_m)}</b>",
-                f"RMS error at equal times <b>{_metres(topic.rms_error_m)}</b>",
+                f"path error <b>{_text(topic.path_error_m, _METRES)}</b>",
+                f"RMS error at equal times <b>{_text(topic.rms_error_m, _METRES)}</b>",
             ]
         lines.append(f'<div data-topic="{escape(path.name)}">{escape(path.name)}: {", ".join(text)}</div>')
     return f'<div class="paths">{"".join(lines) or "no topic carries positions"}</div>'
-
-
-def _metres(value: Number) -> str:
-    return "–" if value is None else f"{value:.3f} m"
 
 
 def packets_html(snapshot: Snapshot) -> str:

@@ -11,7 +11,7 @@ from gr_ros2.cli.params import Number, set_option
 from gr_ros2.core.names import first
 from gr_ros2_lab.cli.params import SCENARIO
 from gr_ros2_lab.report.explain import air_lines
-from gr_ros2_lab.report.table import ledger_table, notes, packets_line, summary_table
+from gr_ros2_lab.report.table import as_table, ledger_grid, notes, packets_line, summary_grid
 from gr_ros2_lab.run.replay import replay as replay_bag
 from gr_ros2_lab.run.scenario import Scenario, load_scenario
 
@@ -51,8 +51,8 @@ def replay(
     for line in done.remarks:
         console.print(line, soft_wrap=True, markup=False, highlight=False)
     console.print(f"{packets_line(result)}\n")
-    console.print(summary_table([result]))
-    console.print(ledger_table(result))
+    for grid in (summary_grid([result]), ledger_grid(result)):
+        console.print(as_table(grid))
     for line in (*air_lines(result), *notes(result)):
         console.print(line)
     console.print(f"\nWritten to {target}", soft_wrap=True)

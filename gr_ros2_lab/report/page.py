@@ -296,51 +296,34 @@ def _draw_received(run: Run, out: Drawings, prefix: str) -> list[Picture]:
     result, trace = run.result, run.trace
     topics = run.messages()
     packets, changes = trace.packets(), [change.t for change in result.changes if change.t is not None]
-    pictures = []
-    pictures.append(out.save(latency_figure(latencies([run])), f"{prefix}latency", _LATENCY))
-    pictures.append(
-        out.save(
+    drawn = [
+        ("latency", latency_figure(latencies([run])), _LATENCY),
+        (
+            "delivery",
             delivery_figure({m.topic: Deliveries.of([m]) for m in topics}, result.duration_s, changes),
-            f"{prefix}delivery",
             "Share delivered of the messages submitted in an interval, and bytes delivered in it",
-        )
-    )
-    pictures.append(
-        out.save(
+        ),
+        (
+            "age",
             age_figure({m.topic: {run.label: m} for m in topics}, {run.label: trace.t_end}, changes),
-            f"{prefix}age",
             "Age of what the receiving robot knows: now minus the submission of the newest message delivered",
-        )
-    )
-    airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
-    if airtime:
-        pictures.append(
-            out.save(
-                airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s, changes),
-                f"{prefix}airtime",
-                "Airtime of the packets that left the source and of those that arrived, without repairs and reports",
-            )
-        )
-    pictures.append(
-        out.save(
-            ledger_figure({topic.topic: topic.ledger for topic in result.topics}),
-            f"{prefix}ledger",
-            "The loss ledger: every sent message has exactly one fate; in brackets how many were sent",
-        )
-    )
+        ),
+    ]
+    if airtime := result.phy.get("airtime_mean_s") or result.phy.get("airtime_s"):
+        figure = airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s, changes)
+        caption = "Airtime of the packets that left the source and of those that arrived, without repairs and reports"
+        drawn.append(("airtime", figure, caption))
+    figure = ledger_figure({topic.topic: topic.ledger for topic in result.topics})
+    caption = "The loss ledger: every sent message has exactly one fate; in brackets how many were sent"
+    drawn.append(("ledger", figure, caption))
     if uses := air_uses(result):
-        caption = "What the packets sent were for, as shares of their airtime"
-        pictures.append(out.save(air_figure(uses), f"{prefix}air", caption))
-    pictures.append(
-        out.save(
-            packets_figure(packets, [m.topic for m in topics]),
-            f"{prefix}packets",
-            "The first packets with new messages: which topics' entries each carries (every other message lighter), "
-            "when it left, and when or whether it arrived",
-            wide=True,
-        )
+        drawn.append(("air", air_figure(uses), "What the packets sent were for, as shares of their airtime"))
+    caption = (
+        "The first packets with new messages: which topics' entries each carries (every other message lighter), when "
+        "it left, and when or whether it arrived"
     )
-    return pictures
+    drawn.append(("packets", packets_figure(packets, [m.topic for m in topics]), caption))
+    return [out.save(figure, prefix + name, caption, name == "packets") for name, figure, caption in drawn]
 
 
 def _draw_team(team: Team, out: Drawings, prefix: str) -> list[Picture]:

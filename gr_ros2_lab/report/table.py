@@ -230,16 +230,6 @@ def as_table(grid: Grid) -> Table:
     return table
 
 
-def summary_table(results: Sequence[Result]) -> Table:
-    """:func:`summary_grid` for the terminal."""
-    return as_table(summary_grid(results))
-
-
-def ledger_table(result: Result) -> Table:
-    """:func:`ledger_grid` for the terminal."""
-    return as_table(ledger_grid(result))
-
-
 def faults(result: Result) -> list[str]:
     """What is wrong in a run, one line each; often empty."""
     lines = [f"{topic.topic}: {topic.corrupt} messages arrived altered" for topic in result.topics if topic.corrupt]

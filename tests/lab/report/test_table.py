@@ -6,36 +6,36 @@ import io
 from dataclasses import replace
 
 from rich.console import Console
-from rich.table import Table
 
 from gr_ros2.observe.result import AgeResult, LatencyResult
 from gr_ros2_lab.record.result import ReceiverResult, Result
 from gr_ros2_lab.report.table import (
     MOST_PATHS,
+    Grid,
     as_table,
     faults,
-    ledger_table,
+    ledger_grid,
     notes,
     pairs_grids,
     paper_grid,
-    summary_table,
+    summary_grid,
 )
 
 
-def _text(table: Table, width: int = 140) -> str:
+def _text(grid: Grid, width: int = 140) -> str:
     console = Console(file=io.StringIO(), width=width)
-    console.print(table)
+    console.print(as_table(grid))
     return console.file.getvalue()  # type: ignore[attr-defined,no-any-return]
 
 
 def test_the_papers_table_with_latency(result: Result) -> None:
-    lines = _text(summary_table([result])).splitlines()
+    lines = _text(summary_grid([result])).splitlines()
     heading = " ".join(lines[2].split() + lines[3].split())
     for name in ("Topic", "Sent", "Recv", "PDR", "Goodput", "[B/s]", "p50", "p99", "[ms]"):
         assert name in heading
     odom = next(line for line in lines if "odom" in line).split()
     assert odom == ["/robot_1/odom", "10", "9", "0.90", "123.5", "100", "200", "300"]
-    lines = _text(summary_table([result, replace(result, scenario="again")])).splitlines()
+    lines = _text(summary_grid([result, replace(result, scenario="again")])).splitlines()
     assert " ".join(lines[3].split()).startswith("Config Topic [s] Sent Recv")
     assert [next(line for line in lines if name in line).split()[2] for name in ("paper-direct", "again")] == [
         "15.0"
@@ -45,17 +45,17 @@ def test_the_papers_table_with_latency(result: Result) -> None:
 
 def test_latencies_keep_three_digits(result: Result) -> None:
     quick = replace(result, topics=(replace(result.topics[0], latency_s=LatencyResult(0.00123456, 0.0567, 1.234)),))
-    assert next(line for line in _text(summary_table([quick])).splitlines() if "odom" in line).split()[-3:] == [
+    assert next(line for line in _text(summary_grid([quick])).splitlines() if "odom" in line).split()[-3:] == [
         *("1.23", "56.7", "1234"),
     ]
 
 
 def test_nothing_is_cut_off_in_80_columns(result: Result) -> None:
-    assert "…" not in _text(summary_table([result]), width=80)
+    assert "…" not in _text(summary_grid([result]), width=80)
 
 
 def test_the_ledger_shows_every_row_that_occurred(result: Result) -> None:
-    text = _text(ledger_table(result))
+    text = _text(ledger_grid(result))
     assert "lost_fragments" in text
     assert "expired" not in text
     assert next(line for line in text.splitlines() if "odom" in line).split() == ["/robot_1/odom", "10", "9", "1"]
@@ -101,7 +101,7 @@ def test_twenty_robots_are_two_matrices_that_can_be_read(result: Result) -> None
     assert lost.sections[0][1][:4] == ("/robot_2", "100", "", "<1")
     assert age.sections[0][1][:4] == ("/robot_2", ".12", "", ".37")
     assert age.sections[0][0][-1] == "2.5"
-    text = _text(as_table(lost), width=110) + _text(as_table(age), width=110)
+    text = _text(lost, width=110) + _text(age, width=110)
     assert "…" not in text
     assert pairs_grids(result) == []
 
@@ -115,7 +115,7 @@ def test_many_paths_have_one_line(result: Result) -> None:
 
 
 def test_the_papers_own_line_stands_above_ours(result: Result) -> None:
-    text = _text(as_table(paper_grid([result, replace(result, scenario="x", phy={"name": "ofdm"})])))
+    text = _text(paper_grid([result, replace(result, scenario="x", phy={"name": "ofdm"})]))
     lines = [line.split() for line in text.splitlines()]
     assert [line for line in lines if line and line[0] in ("OFDM", "Direct")] == [
         ["OFDM", "the", "paper", "38.0", "1328", "12", "0.01", "228.6"],
