@@ -41,9 +41,21 @@ _NAMED = {
 }
 
 
-def write_structure(tree: Composite) -> str:
+def write_structure(node: Node) -> str:
     """The text of a tree."""
-    return _text(tree)
+    if isinstance(node, Scalar):
+        return node.code
+    if isinstance(node, Text):
+        return "s"
+    if isinstance(node, Repeat):
+        several = isinstance(node.element, Composite) and node.element.type_name not in (*TIME_TYPES, QUATERNION_TYPE)
+        element = write_structure(node.element)
+        return f"{'*' if node.count is None else node.count}{f'({element})' if several else element}"
+    if node.type_name in TIME_TYPES:
+        return "T"
+    if node.type_name == QUATERNION_TYPE:
+        return "R"
+    return "".join(write_structure(member) for _, member in node.members)
 
 
 def read_structure(text: str) -> Composite:
@@ -63,22 +75,6 @@ def read_structure(text: str) -> Composite:
     if rest != len(tokens):
         raise CodecError(f"no structure of a type: a parenthesis too many in {text!r}")
     return _composite(members)
-
-
-def _text(node: Node) -> str:
-    if isinstance(node, Scalar):
-        return node.code
-    if isinstance(node, Text):
-        return "s"
-    if isinstance(node, Repeat):
-        several = isinstance(node.element, Composite) and node.element.type_name not in (*TIME_TYPES, QUATERNION_TYPE)
-        element = _text(node.element)
-        return f"{'*' if node.count is None else node.count}{f'({element})' if several else element}"
-    if node.type_name in TIME_TYPES:
-        return "T"
-    if node.type_name == QUATERNION_TYPE:
-        return "R"
-    return "".join(_text(member) for _, member in node.members)
 
 
 def _members(tokens: list[tuple[str | None, str | None]], at: int, depth: int) -> tuple[list[Node], int]:

@@ -80,6 +80,9 @@ class WireError(GrRos2Error, ValueError):
 
     kind = "wire"
 
+    def __init_subclass__(cls, kind: str) -> None:
+        cls.kind = kind
+
     def alone(self) -> WireError:
         """The error without where it was raised: that would keep what was in the packet, in a cycle of references that
         a large process collects seldom."""
@@ -87,130 +90,88 @@ class WireError(GrRos2Error, ValueError):
         return self
 
 
-class LengthError(WireError):
+class LengthError(WireError, kind="length"):
     """More or fewer bytes than ``packet_len`` allows."""
 
-    kind = "length"
 
-
-class CrcError(WireError):
+class CrcError(WireError, kind="crc"):
     """The CRC does not match."""
 
-    kind = "crc"
 
-
-class VersionError(WireError):
+class VersionError(WireError, kind="version"):
     """A version nibble that this decoder does not know."""
 
-    kind = "version"
 
-
-class NoEntriesError(WireError):
+class NoEntriesError(WireError, kind="no_entries"):
     """E = 0."""
 
-    kind = "no_entries"
 
-
-class EntryBoundsError(WireError):
+class EntryBoundsError(WireError, kind="entry_bounds"):
     """An entry header or payload runs past the space before the CRC."""
 
-    kind = "entry_bounds"
 
-
-class PadError(WireError):
+class PadError(WireError, kind="pad"):
     """PAD bytes that are not zero."""
 
-    kind = "pad"
 
-
-class TotalError(WireError):
+class TotalError(WireError, kind="total"):
     """An entry that says its message has no fragments (total = 0)."""
 
-    kind = "total"
 
-
-class IndexRangeError(WireError):
+class IndexRangeError(WireError, kind="index"):
     """An entry whose index is not below its total."""
 
-    kind = "index"
 
-
-class EntryKindError(WireError):
+class EntryKindError(WireError, kind="entry_kind"):
     """An entry of an unknown kind, or whose fields contradict its kind."""
 
-    kind = "entry_kind"
 
-
-class VarintError(WireError):
+class VarintError(WireError, kind="varint"):
     """A number of variable length that is too long, too large, or not in its shortest form."""
 
-    kind = "varint"
 
-
-class WindowError(WireError):
+class WindowError(WireError, kind="window"):
     """A repair whose window, mask and repair id contradict each other."""
 
-    kind = "window"
 
-
-class SealError(WireError):
+class SealError(WireError, kind="seal"):
     """A packet that may be intact, but that cannot be trusted here."""
 
-    kind = "seal"
 
-
-class NoKeyError(SealError):
+class NoKeyError(SealError, kind="no_key"):
     """A sealed packet where no key is configured."""
 
-    kind = "no_key"
 
-
-class NotSealedError(SealError):
+class NotSealedError(SealError, kind="not_sealed"):
     """A packet without a tag where a key is configured."""
 
-    kind = "not_sealed"
 
-
-class WrongKeyError(SealError):
+class WrongKeyError(SealError, kind="wrong_key"):
     """A hello that none of the accepted keys opens, or that is damaged."""
 
-    kind = "wrong_key"
 
-
-class TagError(SealError):
+class TagError(SealError, kind="tag"):
     """A tag that does not match: damaged, forged, or of another start of the sender."""
 
-    kind = "tag"
 
-
-class ReplayedError(SealError):
+class ReplayedError(SealError, kind="replayed"):
     """A packet that was received before, or that is too old to be accepted."""
 
-    kind = "replayed"
 
-
-class NotStoredError(SealError):
+class NotStoredError(SealError, kind="not_stored"):
     """A packet that is not used because the state file cannot be written: it could be used again after a restart."""
 
-    kind = "not_stored"
 
-
-class SameIdError(SealError):
+class SameIdError(SealError, kind="same_id"):
     """A hello under the id of this robot, of a start that is not this one."""
 
-    kind = "same_id"
 
-
-class SourcesError(WireError):
+class SourcesError(WireError, kind="max_sources"):
     """A packet of a further robot, when ``max_sources`` robots are known already."""
 
-    kind = "max_sources"
 
-
-class EncodeError(WireError):
+class EncodeError(WireError, kind="encode"):
     """A packet whose fields or size cannot be put on the wire."""
-
-    kind = "encode"
 
 
 class CodecError(GrRos2Error, ValueError):
