@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 from gr_ros2.codecs.messages import VIDEO
 from gr_ros2.codecs.received_frames import FrameReceiver, frames_output
+from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import BackendMissingError, CodecError, ConfigError, reason
 from gr_ros2.link.events import Accepted, Announced, Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.frames import MARK
@@ -51,7 +52,7 @@ class _Shown(NamedTuple):
     latched: bool
 
 
-class FoxgloveServer:
+class FoxgloveServer(Closing):
     """A server of Foxglove's protocol, and an observer of a link.
 
     :param port: 0 = any that is free
@@ -105,12 +106,6 @@ class FoxgloveServer:
     def close(self) -> None:
         """Serve nothing more."""
         self._server.stop()
-
-    def __enter__(self) -> FoxgloveServer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # ---- observer
 

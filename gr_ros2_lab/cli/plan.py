@@ -9,10 +9,10 @@ from shlex import quote
 
 import click
 from rich import box
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import Number, set_option
 from gr_ros2.link.fates import ARRIVED, Fate
 from gr_ros2.middleware.bag_files import is_bag
@@ -21,7 +21,6 @@ from gr_ros2_lab.run.scenario import Scenario, load_scenario
 from gr_ros2_lab.study.forecast import Advice, Cut, Effect, Forecast, Planner, prepare_processes
 from gr_ros2_lab.study.traffic import link_values, of_recording, recorded_graph
 
-_WIDTH = 110
 _ADVICE = 3
 _BEYOND = 10
 """Times as far as the farthest place of a survey, up to which its fit is said to reach."""
@@ -81,9 +80,7 @@ def plan(
 
 
 def _tell(planner: Planner, advise: bool) -> None:
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=_WIDTH)
+    console = make_console()
     with console.status("the link is simulated"):
         if advise:
             planner.begin()
