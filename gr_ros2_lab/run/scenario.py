@@ -373,24 +373,27 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
                 f"built in are {', '.join(builtin_scenarios())}"
             )
     values = read_settings(path, overrides)
-    values.update((key, value) for key, value in settings.items() if value is not None)
+    given = {key: value for key, value in settings.items() if value is not None}
+    values.update(given)
     scenario = scenario_from(values, str(name_or_path))
     if scenario.task:
         task_class(scenario.task)
-    if _contradicted(overrides):
+    changed = [*overrides, *(f"{key}={value}" for key, value in given.items() if key not in _UNSPOKEN)]
+    if _contradicted(changed):
         # To build it again for a text would take as long as the first time.
-        object.__setattr__(scenario, "description", _described(scenario, overrides))
+        object.__setattr__(scenario, "description", _described(scenario, changed))
     return scenario
 
 
-_DESCRIBED = ("phy", "medium", "relay", "channel", "paths", "repair", "duplex", "gains_db", "paper", "task")
-"""Settings of which the description of a scenario may speak, beside how many robots there are."""
+_UNSPOKEN = frozenset(
+    ("name", "description", "seed", "duration_s", "repetitions", "time", "drain_s", "bag_speed", "own_domains", "graph")
+)
+"""Settings of which no description of a scenario speaks."""
 
 
 def _contradicted(overrides: Sequence[str]) -> bool:
     """Whether the description of a scenario may not be true any more."""
-    keys = [override.partition("=")[0].strip() for override in overrides]
-    return any(key == "robots" or key.partition(".")[0] in _DESCRIBED for key in keys)
+    return any(override.partition("=")[0].partition(".")[0].strip() not in _UNSPOKEN for override in overrides)
 
 
 def _described(scenario: Scenario, overrides: Sequence[str]) -> str:

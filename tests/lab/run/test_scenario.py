@@ -211,3 +211,5 @@ def test_a_description_that_settings_contradict_is_made_from_them() -> None:
         "3 robots, lora at 200,000 samples/s, one channel, exclusive; "
         "team with medium=exclusive, phy.name=lora, robots=3"
     )
+    silent = load_scenario("two-way", ("robots.1.topics=[]",), source="bag:mine").description
+    assert silent.endswith("; two-way with robots.1.topics=[], source=bag:mine")
