@@ -9,13 +9,13 @@ text.
 from __future__ import annotations
 
 import multiprocessing
-import signal
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from multiprocessing.connection import Connection
 from typing import Any
 
+from gr_ros2.core.backends import interrupts_ignored
 from gr_ros2.core.errors import GrRos2Error, RunError
 from gr_ros2.core.watch import wait_until
 from gr_ros2_lab.race.namespaces import enter
@@ -46,7 +46,8 @@ class Worker:
         self._process = _FORKS.Process(
             target=_serve, args=(theirs, namespace, make, arguments), name=f"gr-ros2-{name}", daemon=True
         )
-        self._process.start()
+        with interrupts_ignored():
+            self._process.start()
         theirs.close()
         try:
             self.answer()
@@ -108,7 +109,6 @@ class Worker:
 def _serve(
     line: Connection, namespace: str, make: Callable[..., AbstractContextManager[Any]], arguments: tuple[Any, ...]
 ) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         if namespace:
             enter(namespace)

@@ -8,7 +8,6 @@ use; each advice contains the forecast it is based on.
 from __future__ import annotations
 
 import os
-import signal
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -25,6 +24,7 @@ import numpy as np
 from gr_ros2.codecs.frames import coded_topic
 from gr_ros2.codecs.whole import whole_of
 from gr_ros2.compression import LinkCodec
+from gr_ros2.core.backends import interrupts_ignored
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.core.names import first
 from gr_ros2.link import SentPacket
@@ -646,6 +646,7 @@ def _on_all_processors(
     if processors < 2:
         yield from map(work, scenarios)
         return
+    prepare_processes()
     pool = ProcessPoolExecutor(processors, _FORKS, _begin_process, (work,))
     try:
         yield from pool.map(_process, scenarios)
@@ -657,12 +658,12 @@ def _on_all_processors(
 
 def prepare_processes() -> None:
     """Begin to load what other processes need, which takes a second, while this one goes on."""
-    _FORKS.set_forkserver_preload([__name__])
-    forkserver.ensure_running()
+    with interrupts_ignored():  # the process that waits ends the others
+        _FORKS.set_forkserver_preload([__name__])
+        forkserver.ensure_running()
 
 
 def _begin_process(work: Callable[[Scenario], Forecast]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the process that waits ends the others
     _work.append(work)
 
 

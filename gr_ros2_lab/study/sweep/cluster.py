@@ -16,7 +16,7 @@ from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
-from multiprocessing import forkserver, get_context, resource_tracker
+from multiprocessing import forkserver, get_context
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from distributed.client import FuturesCancelledError
 from distributed.scheduler import KilledWorker
 
 from gr_ros2 import __version__
+from gr_ros2.core.backends import interrupts_ignored
 from gr_ros2.core.errors import ConfigError, GrRos2Error, RunError
 from gr_ros2.settings.files import REGISTRY_DIR, find_registry
 from gr_ros2_lab.record.result import Result
@@ -61,7 +62,7 @@ def local_cluster(processes: int) -> Iterator[LocalCluster]:
         "distributed.worker.multiprocessing-method": _FORKS.get_start_method(),
     }
     with dask.config.set(settings):
-        with _interrupts_ignored():
+        with interrupts_ignored():
             _load_for_workers()
             cluster = LocalCluster(
                 n_workers=processes,
@@ -215,18 +216,6 @@ def _check_workers(client: Client, address: str) -> None:
                 f"--scheduler {address}: worker {worker} has {version or 'no gr-ros2'}, here is {__version__}; "
                 "install the same there"
             )
-
-
-@contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """Processes and threads that are started inside ignore Ctrl-C. A terminal sends it to a whole process group."""
-    # multiprocessing unblocks signals when it starts its resource tracker, so the tracker must already run.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

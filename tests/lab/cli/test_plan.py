@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
+import signal
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
@@ -30,6 +32,10 @@ def test_it_says_what_fits(capsys: pytest.CaptureFixture[str]) -> None:
     assert "a packet of 64 B takes 13.12 ms, 76.2 packets/s" in out
     assert "/robot_1/odom" in out
     assert ": it fits." in out
+    status = Path(f"/proc/{forkserver._forkserver._forkserver_pid}/status").read_text()
+    blocked = re.search(r"SigBlk:\s*(\w+)", status)
+    assert blocked is not None
+    assert int(blocked[1], 16) >> (signal.SIGINT - 1) & 1, "Ctrl-C is for the process that waits, also during imports"
 
 
 def test_it_says_that_it_does_not_try_a_task(capsys: pytest.CaptureFixture[str]) -> None:
