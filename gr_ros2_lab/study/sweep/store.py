@@ -59,8 +59,9 @@ class Store:
 
 def run_key(scenario: Scenario) -> str:
     """The name of a run's file."""
-    # Files are identified by their contents, not by their paths.
-    identity = {"version": __version__, "settings": without_registry(dump(scenario)), "files": list(_files(scenario))}
+    # Files are identified by their contents, not by their paths. A description changes nothing.
+    settings = {key: value for key, value in without_registry(dump(scenario)).items() if key != "description"}
+    identity = {"version": __version__, "settings": settings, "files": list(_files(scenario))}
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:_KEY_CHARACTERS]
 
 
