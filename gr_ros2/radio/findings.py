@@ -122,7 +122,8 @@ def ping(live: LiveEnd[OpenEndpoint], robot: int, now: float, *, anew: bool = Fa
         snrs = {peer.robot: peer.snr_db for peer in live.endpoint.peers(now)}
         live.rouse()
     only = pings.snr_db() if list(snrs) == [robot] else None  # where no other robot's packet may be the newest
-    return {**told, "robot": robot, "snr_here_db": only if snrs.get(robot) is None else snrs[robot]}
+    snr_db = only if snrs.get(robot) is None else snrs[robot]
+    return {**told, "robot": robot, "heard": sorted(snrs), "snr_here_db": snr_db}
 
 
 def differences(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
@@ -303,6 +304,8 @@ def in_words(peer: Mapping[str, Any]) -> str:
         parts.append(f"lost {peer['lost_there']} there, {peer['lost_back']} back")
     else:
         parts.append(f"{peer['asked']} asked, none answered")
+        if (heard := peer.get("heard")) is not None and peer["robot"] not in heard:
+            parts.append("it is not heard" + (f", heard are {', '.join(map(str, heard))}" if heard else ""))
     snrs = [("here", peer["snr_here_db"]), ("there", peer["snr_there_db"])]
     if any(snr is not None for _, snr in snrs):
         parts.append("SNR " + ", ".join(f"{snr:.1f} dB {where}" for where, snr in snrs if snr is not None))

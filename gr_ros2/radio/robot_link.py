@@ -415,8 +415,10 @@ class RobotLink(Flowgraph):
         """Ask another robot, which answers at once; returns what has come of all questions to it so far.
 
         :param anew: forget the earlier ones
-        :raises ConfigError: for a number that no robot has
+        :raises ConfigError: for a number that no other robot has
         """
+        if robot == self.source.src_id:
+            raise ConfigError(f"robot {robot}: asks here; name another one")
         return {**ping(self._end_with(robot), robot, self._clock(), anew=anew), **self.source.rate()}
 
     @property

@@ -27,7 +27,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.files import write_text, write_whole
 from gr_ros2.link.fates import Fate
 from gr_ros2_lab.record.repetitions import run_folders
-from gr_ros2_lab.record.result import Result, air_uses, read_result, topic_numbers
+from gr_ros2_lab.record.result import RESULT_FILE, Result, air_uses, read_result, topic_numbers
 from gr_ros2_lab.record.team import Team, read_team
 from gr_ros2_lab.record.trace import Messages, Trace, read_trace, write_csv
 from gr_ros2_lab.report.explain import explanation
@@ -135,8 +135,9 @@ def read_runs(directories: Iterable[str | Path]) -> list[Run]:
     paths = [folder for directory in directories for folder in run_folders(Path(directory))]
     found = []
     for path in paths:
-        if not path.is_dir():
-            raise ConfigError(f"{path}: no such folder; give the folder of a run, with result.json in it")
+        if not (path / RESULT_FILE).exists():
+            what = f"has no {RESULT_FILE}" if path.is_dir() else "no such folder"
+            raise ConfigError(f"{path}: {what}; give the folder of a run, with {RESULT_FILE} in it")
         found.append((path, read_result(path), read_trace(path)))
     twice = [str(path) for path in paths if sum(path.resolve() == other.resolve() for other in paths) > 1]
     if twice:

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from gr_ros2.cli.link import _live
 from gr_ros2.cli.status import peer_table
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.dashboard.monitor import RunMonitor
 from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.radio.findings import about, compared, differences, heard_nobody, in_words
@@ -47,6 +48,9 @@ def test_ends_that_match_say_so_with_figures(tmp_path: Path) -> None:
         wait_for(lambda: one.link.ping(2)["answered"] >= 3, "answers")
         told = one.link.ping(2)
         (peer,) = one.link.stats()["peers"]
+        assert in_words(one.link.ping(7)).endswith(" asked, none answered; it is not heard, heard are 2")
+        with pytest.raises(ConfigError, match="robot 1: asks here"):
+            one.link.ping(1)
     assert differences(about(one.link.config, [one.link.phy]), told["about"]) == []
     assert abs(told["clock_s"]) < 1.0
     assert (peer["robot"], peer["sealed"], peer["silent"]) == (2, True, False)

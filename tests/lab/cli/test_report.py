@@ -88,6 +88,8 @@ def test_a_missing_folder_is_one_line_and_status_2(
     make_run(tmp_path / "a", "one")
     assert command.run([name, str(tmp_path / "a"), str(tmp_path / "nowhere")]) == 2
     assert "nowhere: no such folder; give the folder of a run" in capsys.readouterr().err
+    assert command.run([name, str(tmp_path / "a"), str(tmp_path)]) == 2
+    assert f"{tmp_path}: has no result.json; give the folder of a run" in capsys.readouterr().err
 
 
 @pytest.mark.slow
