@@ -136,8 +136,8 @@ def read_runs(directories: Iterable[str | Path]) -> list[Run]:
     found = []
     for path in paths:
         if not (path / RESULT_FILE).exists():
-            what = f"has no {RESULT_FILE}" if path.is_dir() else "no such folder"
-            raise ConfigError(f"{path}: {what}; give the folder of a run, with {RESULT_FILE} in it")
+            what = f"{path / RESULT_FILE}: no such file" if path.is_dir() else f"{path}: no such folder"
+            raise ConfigError(f"{what}; give the folder of a run, with {RESULT_FILE} in it")
         found.append((path, read_result(path), read_trace(path)))
     twice = [str(path) for path in paths if sum(path.resolve() == other.resolve() for other in paths) > 1]
     if twice:
