@@ -129,7 +129,7 @@ def test_runs_of_one_scenario_are_called_after_their_folders(tmp_path: Path) -> 
 def test_what_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="nowhere: no such folder"):
         read_runs([tmp_path / "nowhere"])
-    with pytest.raises(ConfigError, match=r"result\.json: cannot be read"):
+    with pytest.raises(ConfigError, match=r"result\.json: no such file; give the folder of a run"):
         read_runs([tmp_path])
     make_run(tmp_path / "a")
     with pytest.raises(ConfigError, match="a: given twice"):
