@@ -6,13 +6,16 @@ all times are seconds on one clock.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from gr_ros2.core.arrays import Floats
 from gr_ros2.link.fates import arrived
-from gr_ros2.observe.latency import Latency, latency, latency_cdf
+from gr_ros2.observe.latency import latency, latency_cdf
+from gr_ros2.observe.result import AgeResult, LatencyResult, TopicResult
 from gr_ros2_lab.record.ledger import TopicLedger
 
 
@@ -24,49 +27,40 @@ class Age:
     peak: float
 
 
-@dataclass(frozen=True, slots=True)
-class TopicMetrics:
-    """The numbers of one topic.
-
-    :param pdr: delivered / sent, 0..1; None where nothing was sent
-    :param goodput_Bps: delivered serialized bytes / duration, B/s; None where the duration is 0
-    :param latency_cdf_s: CDF_POINTS quantiles of the latency, ascending; empty where nothing was delivered
-    :param negative_latencies: deliveries that seem to come before their submission
-    """
-
-    sent: int
-    delivered: int
-    delivered_bytes: int
-    pdr: float | None
-    goodput_Bps: float | None
-    latency_s: Latency | None
-    latency_cdf_s: tuple[float, ...]
-    negative_latencies: int
-    age_s: Age | None
-
-
-def topic_metrics(ledger: TopicLedger, duration_s: float, t_end: float) -> TopicMetrics:
-    """All numbers of one topic.
+def topic_result(book: TopicLedger, duration_s: float, t_end: float, **named: Any) -> TopicResult:
+    """The result of one topic.
 
     :param duration_s: s during which messages were submitted
     :param t_end: s on the ledger's clock, end of the observation of the age: the end of submission
+    :param named: its name and type, and what is known of its paths
     """
-    t_sent, t_delivered = np.frombuffer(ledger.t_sent), np.frombuffer(ledger.t_delivered)
+    t_sent, t_delivered = np.frombuffer(book.t_sent), np.frombuffer(book.t_delivered)
     done = ~np.isnan(t_delivered)
     latencies = np.sort(t_delivered[done] - t_sent[done])
-    delivered = arrived(ledger.fates)
-    delivered_bytes = int(np.array(ledger.size)[done].sum())
-    return TopicMetrics(
-        sent=ledger.sent,
+    quantiles, aged = latency(latencies), age(t_sent[done], t_delivered[done], t_end)
+    delivered = arrived(book.fates)
+    return TopicResult(
+        src_id=book.src_id,
+        sent=book.sent,
         delivered=delivered,
-        delivered_bytes=delivered_bytes,
-        pdr=delivered / ledger.sent if ledger.sent else None,
-        goodput_Bps=delivered_bytes / duration_s if duration_s > 0 else None,
-        latency_s=latency(latencies),
+        pdr=delivered / book.sent if book.sent else None,
+        goodput_Bps=delivered_bytes(book) / duration_s if duration_s > 0 else None,
+        latency_s=LatencyResult() if quantiles is None else LatencyResult(**asdict(quantiles)),
+        latency_clock=None if quantiles is None else "submit",
         latency_cdf_s=latency_cdf(latencies),
         negative_latencies=int((latencies < 0).sum()),
-        age_s=age(t_sent[done], t_delivered[done], t_end),
+        age_s=AgeResult() if aged is None else AgeResult(**asdict(aged)),
+        ledger=dict(sorted(book.fates.items())),
+        hops={str(hops): count for hops, count in sorted(Counter(book.hops).items()) if hops >= 0},
+        corrupt=book.corrupt,
+        repeats_delivered=book.repeats_delivered,
+        **named,
     )
+
+
+def delivered_bytes(book: TopicLedger) -> int:
+    """Serialized bytes of the messages delivered."""
+    return int(np.array(book.size)[~np.isnan(np.frombuffer(book.t_delivered))].sum())
 
 
 def age(t_sent: Floats, t_delivered: Floats, t_end: float) -> Age | None:

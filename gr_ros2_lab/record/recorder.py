@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict
 from math import inf
 from typing import Any
 
@@ -17,11 +16,12 @@ import numpy.typing as npt
 
 from gr_ros2.core.arrays import Floats
 from gr_ros2.link.events import Accepted, AirKind, Delivered, Received, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.link.fates import arrived
 from gr_ros2.observe.positions import PositionReader, position_reader
-from gr_ros2.observe.result import AgeResult, LatencyResult, TopicResult
+from gr_ros2.observe.result import TopicResult
 from gr_ros2.settings.registry import MAX_TOPICS, Registry, Topic
 from gr_ros2_lab.record.ledger import Ledger, TopicLedger
-from gr_ros2_lab.record.metrics import TopicMetrics, topic_metrics
+from gr_ros2_lab.record.metrics import delivered_bytes, topic_result
 from gr_ros2_lab.record.trace import PacketLog, Trace, Track, make_trace
 
 GRID_POINTS = 1000
@@ -165,10 +165,9 @@ class Recorder:
         for key in self._keys:
             books.setdefault(key, TopicLedger(*key))
         self._books = [books[key] for key in sorted(books)]
-        numbers = {key: topic_metrics(books[key], duration_s, t_end) for key in sorted(books)}
-        self._delivered = sum(metrics.delivered for metrics in numbers.values())
-        self._delivered_bytes = sum(metrics.delivered_bytes for metrics in numbers.values())
-        return tuple(self._topic_result(books[key], metrics) for key, metrics in numbers.items())
+        self._delivered = sum(arrived(book.fates) for book in self._books)
+        self._delivered_bytes = sum(map(delivered_bytes, self._books))
+        return tuple(self._topic_result(book, duration_s, t_end) for book in self._books)
 
     def airtime(self, of_packet: Callable[[int | None, int], float] | None) -> dict[str, Any]:
         """Airtimes in s: of the longest packet, of a packet sent on average, and of all packets sent per message and
@@ -248,34 +247,19 @@ class Recorder:
             return f"the topics that /{namespace.strip('/')} announces"
         return topic.on_graph(namespace) if topic is not None else f"/{namespace.strip('/')}/topic_{topic_id}"
 
-    def _topic_result(self, book: TopicLedger, numbers: TopicMetrics) -> TopicResult:
+    def _topic_result(self, book: TopicLedger, duration_s: float, t_end: float) -> TopicResult:
         topic = self._topic(book.topic_id)
         key = (book.src_id, book.topic_id)
         sent, received = self.sent.get(key, Track()), self.received.get(key, Track())
         (t_sent, xy_sent), (t_received, xy_received) = sent.points(), received.points()
-        return TopicResult(
+        return topic_result(
+            book,
+            duration_s,
+            t_end,
             topic=self._name(*key),
             type=topic.type_name if topic is not None else "",
-            src_id=book.src_id,
-            sent=numbers.sent,
-            delivered=numbers.delivered,
-            pdr=numbers.pdr,
-            goodput_Bps=numbers.goodput_Bps,
-            latency_s=LatencyResult(**_values(numbers.latency_s)),
-            latency_clock="submit" if numbers.latency_s is not None else None,
-            age_s=AgeResult(**_values(numbers.age_s)),
             path_error_m=path_error(xy_sent, xy_received),
             rms_error_m=rms_error(t_sent, xy_sent, t_received, xy_received),
             left_out_sent=sent.left_out,
             left_out_received=received.left_out,
-            ledger=dict(sorted(book.fates.items())),
-            hops={str(hops): count for hops, count in sorted(Counter(book.hops).items()) if hops >= 0},
-            corrupt=book.corrupt,
-            repeats_delivered=book.repeats_delivered,
-            negative_latencies=numbers.negative_latencies,
-            latency_cdf_s=numbers.latency_cdf_s,
         )
-
-
-def _values(numbers: Any) -> dict[str, float]:
-    return asdict(numbers) if numbers is not None else {}

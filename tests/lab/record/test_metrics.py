@@ -12,14 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.observe.latency import latency, latency_cdf
+from gr_ros2.observe.result import AgeResult, LatencyResult
 from gr_ros2_lab.record.ledger import TopicLedger
-from gr_ros2_lab.record.metrics import age, age_quantile, age_sawtooth, topic_metrics
+from gr_ros2_lab.record.metrics import age, age_quantile, age_sawtooth, delivered_bytes, topic_result
+
+_NAMED = {"topic": "/odom", "type": "nav_msgs/msg/Odometry", "path_error_m": None}
 
 
 def test_nothing_sent_has_no_numbers() -> None:
-    numbers = topic_metrics(TopicLedger(1, 0), duration_s=0, t_end=10)
+    numbers = topic_result(TopicLedger(1, 0), duration_s=0, t_end=10, **_NAMED)
     assert (numbers.sent, numbers.delivered, numbers.latency_cdf_s, numbers.negative_latencies) == (0, 0, (), 0)
-    assert [numbers.pdr, numbers.goodput_Bps, numbers.latency_s, numbers.age_s] == [None] * 4
+    assert [numbers.pdr, numbers.goodput_Bps, numbers.latency_clock] == [None] * 3
+    assert (numbers.latency_s, numbers.age_s) == (LatencyResult(), AgeResult())
 
 
 def test_one_lost_of_four() -> None:
@@ -32,9 +36,8 @@ def test_one_lost_of_four() -> None:
         t_delivered=array("d", [0.5, nan, 2.5, 2.9]),
         size=array("L", [10, 10, 20, 30]),
     )
-    numbers = topic_metrics(book, duration_s=4, t_end=4)
-    assert (numbers.pdr, numbers.goodput_Bps, numbers.delivered_bytes) == (0.75, 15.0, 60)
-    assert numbers.latency_s is not None
+    numbers = topic_result(book, duration_s=4, t_end=4, **_NAMED)
+    assert (numbers.pdr, numbers.goodput_Bps, delivered_bytes(book)) == (0.75, 15.0, 60)
     assert numbers.latency_s.p50 == numbers.latency_s.max == 0.5
     assert numbers.negative_latencies == 1  # the clock of the last one was off: kept and counted
     assert numbers.latency_cdf_s[0] == pytest.approx(-0.1)
