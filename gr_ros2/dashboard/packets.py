@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from gr_ros2.dashboard.topic_names import TopicNames
 from gr_ros2.dashboard.views import PacketView, SpanView
 from gr_ros2.link.events import Received, Rejected
-from gr_ros2.wire import QOS_NAMES, Packet, Span, format_of
+from gr_ros2.wire import Packet, Span, format_of
 
 NO_COLOUR = -1
 """Place in the palette of an unknown topic."""
@@ -36,28 +36,13 @@ def packet_views(
             continue
         packet = event.packet
         wire = format_of(packet.version)
-        missing = missing_before(packet, newest)
-        views.append(
-            PacketView(
-                t - start,
-                len(event.data),
-                version=packet.version,
-                qos=QOS_NAMES[packet.qos],
-                compressed=packet.compressed,
-                encrypted=packet.encrypted,
-                src_id=packet.src_id,
-                dst_id=packet.dst_id,
-                seq=packet.seq,
-                hop=packet.hop,
-                entries=len(packet.entries),
-                spans=tuple(
-                    _span(span, packet.src_id, names, colours)
-                    for span in wire.layout(packet, packet_len, len(event.data))
-                    if span.size
-                ),
-                missing=missing,
-            )
+        spans = tuple(
+            _span(span, packet.src_id, names, colours)
+            for span in wire.layout(packet, packet_len, len(event.data))
+            if span.size
         )
+        missing = missing_before(packet, newest)
+        views.append(PacketView(t - start, len(event.data), packet, spans=spans, missing=missing))
     return tuple(views)
 
 

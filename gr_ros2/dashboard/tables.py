@@ -16,7 +16,7 @@ from gr_ros2.link.events import AirKind
 from gr_ros2.link.fates import Fate, fate_order
 from gr_ros2.observe.colours import COLOURS, fate_colour, ink_on
 from gr_ros2.observe.team import PairView
-from gr_ros2.wire import BROADCAST
+from gr_ros2.wire import BROADCAST, QOS_NAMES
 
 Number = float | int | None
 
@@ -282,20 +282,20 @@ def packets_html(snapshot: Snapshot) -> str:
     return f'<div class="packets">{head}{"".join(lines) or "<div class=gap>no packet yet</div>"}</div>'
 
 
-def _packet(packet: PacketView) -> str:
-    time = f"{packet.t:.3f}"
-    if packet.refused:
+def _packet(view: PacketView) -> str:
+    time, packet = f"{view.t:.3f}", view.packet
+    if packet is None:
         return (
             f'<div class="packet refused"><span>{time}</span><span></span><span></span><span></span><span></span>'
-            f'<span></span><span></span><span></span><div class="bytes"><i style="flex:1">{escape(packet.refused)}</i>'
+            f'<span></span><span></span><span></span><div class="bytes"><i style="flex:1">{escape(view.refused)}</i>'
             "</div></div>"
         )
     flags = ("C" if packet.compressed else "") + ("E" if packet.encrypted else "") or "–"
     to = "all" if packet.dst_id == BROADCAST else str(packet.dst_id)
     return (
         f'<div class="packet"><span>{time}</span><span>{packet.version}</span><span>{packet.src_id} → {to}</span>'
-        f"<span>{packet.seq}</span><span>{packet.hop}</span><span>{packet.qos}</span><span>{flags}</span>"
-        f'<span>{packet.entries}</span><div class="bytes">{"".join(map(_span, packet.spans))}</div></div>'
+        f"<span>{packet.seq}</span><span>{packet.hop}</span><span>{QOS_NAMES[packet.qos]}</span><span>{flags}</span>"
+        f'<span>{len(packet.entries)}</span><div class="bytes">{"".join(map(_span, view.spans))}</div></div>'
     )
 
 

@@ -16,6 +16,7 @@ from gr_ros2.dashboard.windows import Point
 from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.observe.latency import Latency
 from gr_ros2.observe.team import TeamView
+from gr_ros2.wire import Packet
 
 SILENT_S = 5.0
 """s without a packet after which a link is down, and what was received is old."""
@@ -145,24 +146,16 @@ class PacketView:
     """One packet as the sink got it.
 
     :param t: s since the start
-    :param refused: why it is not a valid packet, '' if it is valid
-    :param entries: number of entries
+    :param packet: None where it is not a valid one
+    :param refused: why it is not, '' if it is valid
     :param spans: the parts of the packet, in the order of its bytes
     :param missing: packets of this source that are missing between the one shown before and this one
     """
 
     t: float
     size: int
+    packet: Packet | None = None
     refused: str = ""
-    version: int = 0
-    qos: str = ""
-    compressed: bool = False
-    encrypted: bool = False
-    src_id: int = 0
-    dst_id: int = 0
-    seq: int = 0
-    hop: int = 0
-    entries: int = 0
     spans: tuple[SpanView, ...] = ()
     missing: int = 0
 

@@ -177,10 +177,11 @@ def test_packets_field_by_field() -> None:
     feed.hear(b"no packet", 11.0)
     *packets, refused = state.tick(12.0).last_packets
     assert [packet.missing for packet in packets] == [0, 0, 2, *[0] * (len(packets) - 3)]
-    first = packets[0]
-    assert (first.version, first.src_id, first.dst_id, first.hop, first.qos) == (0, SRC, 255, 5, "default")
-    assert first.entries == 1
-    *_, entry, crc = first.spans
+    first = packets[0].packet
+    assert first is not None
+    assert (first.version, first.src_id, first.dst_id, first.hop, first.qos) == (0, SRC, 255, 5, 0)
+    assert len(first.entries) == 1
+    *_, entry, crc = packets[0].spans
     assert (entry.kind, entry.colour, entry.size, crc.kind) == ("entry", 1, 56, "crc")
     assert re.fullmatch(r"raw #\d+\[0/6\] 51 B", entry.text)
     assert [span.kind for span in packets[-1].spans] == ["head", "ids", "entry", "pad", "crc"]
