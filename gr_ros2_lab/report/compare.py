@@ -5,6 +5,7 @@ Invariant: all numbers come from the runs' own files; a dash means that a run do
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,7 @@ def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str
         if isinstance(value, Mapping) and value:
             yield from _flat(value, f"{above}{key}.")
         else:
-            yield above + key, str(value)
+            yield above + key, value if isinstance(value, str) else json.dumps(value)  # as after --set
 
 
 def lateness_of(runs: Sequence[Run]) -> list[str]:
