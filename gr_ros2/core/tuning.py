@@ -1,7 +1,8 @@
 """The constants of the engines that were found by measurement, each with what it is and what measured it.
 
-What follows from the wire format, bounds memory or keeps forgers out stands in the module that it concerns. Times hold
-for packets that come as often as ``turn_s`` says, and are longer on a slow channel (``Settings.slower``).
+What follows from the wire format, bounds memory, keeps forgers out or is about one computer stands in the module that
+it concerns. Times hold for packets that come as often as ``turn_s`` says, and are longer on a slow channel
+(``Settings.slower``).
 
 Invariant: it holds values only, and nobody changes them: whoever wants others passes in another ``Tuning``, as
 ``python -m bench constants`` does. What that bench varies without a word here was measured by it.
@@ -307,10 +308,16 @@ class Tuning:
     one of four topics takes 14: every 5 s, tables of robots that are known left no time for that of another one over a
     line of four."""
 
-    # ---- packets of several radios, which overtake each other
+    # ---- several radios, whose packets overtake each other, by ``bench radios``
 
+    bond_like: float = 1.25
+    """Airtime of a packet, over that of the fastest radio, up to which a radio shares the load. With 2, packets of the
+    slower one count as lost before they can have come."""
+    bond_weight: float = 1 / 16
+    """Weight of the newest packet in the share of them that comes over a radio: eleven that do not come end its
+    turn."""
     overtaken_most_s: float = 0.02
-    """s for which a message waits at most; what comes later has not been overtaken (``bench radios``)."""
+    """s for which a message waits at most; what comes later has not been overtaken."""
     overtaken_some: float = 0.01
     """Share of packets that are overtaken from which on messages wait."""
     overtaken_share_weight: float = 1 / 64

@@ -16,14 +16,10 @@ from collections import deque
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
+from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.airtime import OUTSTANDING
 from gr_ros2.link.events import Gone, Received, ReceiverEvent
 
-LIKE = 1.25
-"""Airtime of a packet, over that of the fastest radio, up to which a radio shares the load. With 2, packets of the
-slower one count as lost before they can have come."""
-WEIGHT = 1 / 16
-"""Weight of the newest packet in the share of them that comes over a radio: eleven that do not come end its turn."""
 _REMEMBERED = 1024
 """Packets of which copies are recognized."""
 
@@ -48,7 +44,8 @@ class Bond:
         had no room; packets that came over it first, and as a copy
     """
 
-    def __init__(self, airtimes: Sequence[float], apart: Collection[int] = ()) -> None:
+    def __init__(self, airtimes: Sequence[float], apart: Collection[int] = (), tuning: Tuning = Tuning()) -> None:
+        self._tuning = tuning
         self._airtimes, self.apart = tuple(airtimes), frozenset(apart)
         every = range(len(self._airtimes))
         self.sent, self.copied, self.skipped, self.came, self.copies = ([0 for _ in every] for _ in range(5))
@@ -132,7 +129,7 @@ class Bond:
         known.radios |= bit
         self.copies[radio] += 1
         if known.src_id in self._heard:
-            self._heard[known.src_id][radio] += WEIGHT
+            self._heard[known.src_id][radio] += self._tuning.bond_weight
             self._choose()
         return False
 
@@ -176,7 +173,8 @@ class Bond:
         known.src_id = src_id
         shares = self._heard.get(src_id, [1.0 for _ in self._airtimes])
         came = [bool(known.radios >> radio & 1) for radio in range(len(shares))]
-        self._heard[src_id] = [share + (here - share) * WEIGHT for share, here in zip(shares, came, strict=True)]
+        weight = self._tuning.bond_weight
+        self._heard[src_id] = [share + (here - share) * weight for share, here in zip(shares, came, strict=True)]
         self._choose()
 
     def _choose(self) -> None:
@@ -187,7 +185,7 @@ class Bond:
         usable = [there and fine for there, fine in zip(here, good, strict=True)]
         if not any(usable):
             usable = here if any(here) else ours
-        most = LIKE * min(takes for takes, use in zip(self._airtimes, usable, strict=True) if use)
+        most = self._tuning.bond_like * min(takes for takes, use in zip(self._airtimes, usable, strict=True) if use)
         self.carries = [use and takes <= most for takes, use in zip(self._airtimes, usable, strict=True)]
 
     def _next(self) -> int:

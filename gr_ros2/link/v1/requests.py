@@ -31,13 +31,12 @@ class Requests:
 
     def told(self, now: float) -> None:
         """A robot may have named what this one lacks."""
-        for neighbour in self._neighbours:
-            if neighbour.proven:
-                self._want(neighbour, self._kept(neighbour, now), now)
+        for neighbour in self._proven():
+            self._want(neighbour, self._kept(neighbour, now), now)
 
     def next(self) -> float:
         """When a request may have to leave, s; infinite for never."""
-        lost = (each.asked.get(topic, -inf) for each in self._neighbours if each.proven for topic in each.lost_frames)
+        lost = (each.asked.get(topic, -inf) for each in self._proven() for topic in each.lost_frames)
         return max(self.check_at, min(self._wanted_at, min(lost, default=inf)))
 
     def entries(self, room: int, now: float) -> list[Ask]:
@@ -47,7 +46,7 @@ class Requests:
             return found
         self.check_at = now + self._tuning.ask_check_s
         self.crowded, self._wanted_at = False, inf
-        for neighbour in [neighbour for neighbour in self._neighbours if neighbour.proven]:
+        for neighbour in self._proven():
             kept, asked = self._kept(neighbour, now), neighbour.asked
             lacking = dict.fromkeys([*kept, *neighbour.lost_frames])
             wanted = bytes(topic for topic in lacking if now >= asked.get(topic, -inf))
@@ -61,6 +60,10 @@ class Requests:
                 asked.update(dict.fromkeys(said, now + self._tuning.ask_s * self._settings.slower))
             self._want(neighbour, kept, now)
         return found
+
+    def _proven(self) -> list[Neighbour]:
+        """Those who are asked."""
+        return [neighbour for neighbour in self._neighbours if neighbour.proven]
 
     def _want(self, neighbour: Neighbour, topics: Iterable[int], now: float) -> None:
         for topic in topics:

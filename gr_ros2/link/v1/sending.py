@@ -127,7 +127,7 @@ class SendingSide:
             idle = packing.next_timeout(now) > now
             if hellos.urgent(now, idle=idle, latency=packing.urgent, heard=bool(self._window.peers)):
                 return self._hello(slot)
-        elif self._joins and not hellos.met_all and packing.next_timeout(now) <= now:
+        elif self._unmet and packing.next_timeout(now) <= now:
             return self._hello(slot)  # whoever hears this packet first needs no other
         if now >= self.pings.due:
             snrs_db = {n.src_id: n.inbox.reports.snr.snr_db for n in self._neighbours.all.values()}
@@ -372,6 +372,11 @@ class SendingSide:
         """Whether hellos go along with messages: turns are rare, and no message in the clear would betray anything."""
         return self.settings.turns_are_rare and not self._writer.sealed and self._rate is None
 
+    @property
+    def _unmet(self) -> bool:
+        """Whether a hello joins messages because somebody may hear them who has none."""
+        return self._joins and not self.hellos.met_all
+
     def _hello(self, slot: SendSlot) -> SentPacket:
         now, window, kept, newest = slot.now, self._window, self._messages.kept, self._window.packets.newest
         again = newest == self._hello_number and not self.hellos.starting
@@ -382,7 +387,7 @@ class SendingSide:
         self._hello_number = newest
         self.hellos.begin()
         starting = self.hellos.starting
-        unmet = self._joins and not self.hellos.met_all
+        unmet = self._unmet
         often = starting or unmet or (now >= self._table_at and not self.hellos.lone)
         if often and (unmet or not window.peers) and kept.digest:  # no report says whether it has arrived
             self._table_at = now + kept.table_packets * self._pace.interval / self._tuning.table_share
