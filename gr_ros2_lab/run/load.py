@@ -108,11 +108,8 @@ def recording(scenario: Scenario) -> BagContents:
 def _sim_load(scenario: Scenario, robot: RobotConfig, registry: Registry) -> tuple[float, float]:
     names = source_names(robot, registry)
     duration = min(_SAMPLE_S, scenario.duration_s)
-    sizes = {
-        message.topic: len(message.payload)
-        for message in Fleet(scenario.sim).messages(duration)
-        if message.topic in names
-    }
+    messages = Fleet(scenario.sim).messages(duration, topics=names)
+    sizes = {message.topic: len(message.payload) for message in messages}
     rates = Fleet(scenario.sim).rates()
     packets = 0.0
     for topic, size in sizes.items():
