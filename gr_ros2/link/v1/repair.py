@@ -16,14 +16,15 @@ What is alive says ``sent_packets``, what reports tell ``peers``, and what holds
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from math import inf
 from typing import Literal
 
 from gr_ros2.core.tuning import Tuning
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.v1.combining import Combining, Repair
 from gr_ros2.link.v1.lifetime import Lifetime
-from gr_ros2.link.v1.peers import Peers
+from gr_ros2.link.v1.peers import REACH, Peers
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.shared import SharedRepairs
 from gr_ros2.link.v1.thrift import Thrift
@@ -256,10 +257,20 @@ class RepairWindow:
 
     def _alone(self, record: Sent, now: float) -> Repair | None:
         record.at = now
-        return self._combination([record], now)
+        repair = self._combination([record], now)
+        if repair is None and record.number + REACH < self.packets.newest:
+            # It is waited for, and nothing that is alive, or will be, can bring it back above what the peer was told to
+            # prove: the peer has taken an earlier proof. If it has not, what the packet holds is over in the end, or
+            # its topic would stop for good.
+            if self.packets.full(record.number):
+                for lifetime in record.lifetimes:
+                    lifetime.expires = -inf
+                return None
+            repair = self._combination([record], now, (0,))
+        return repair
 
-    def _combination(self, window: list[Sent], now: float) -> Repair | None:
-        found = self._combining.combine(window, self.peers.provens, now)
+    def _combination(self, window: list[Sent], now: float, provens: Sequence[int] = ()) -> Repair | None:
+        found = self._combining.combine(window, provens or self.peers.provens, now)
         self._no_place = found is None
         if found is None:
             return None

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.link.events import Delivered
@@ -36,6 +36,7 @@ EPISODES = st.lists(
     loss=st.sampled_from([0.0, 0.1, 0.3]),
     episodes=EPISODES,
 )
+@example(mode="authenticate", count=3, relays=True, loss=0.3, episodes=[(PAIRS, 25.0, 0), (PAIRS, 1.0, 3), (3, 4.0, 0)])
 def test_every_packet_ends(
     mode: SealMode,
     count: int,

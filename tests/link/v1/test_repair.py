@@ -430,6 +430,24 @@ def test_a_report_tells_that_an_earlier_proof_was_taken_than_the_last_one() -> N
     assert again is not None and (again.number, again.mask) == (363, 1)
 
 
+def test_what_nothing_alive_brings_back_above_the_proof_is_sent_without_and_is_over_in_the_end() -> None:
+    sender = RepairWindow("thrifty", ROOM)
+    sender.peers.meet(2, 0.0)
+    for number in range(1, 301):
+        lifetime = Lifetime(in_order=True) if number in (50, 300) else Lifetime(expires=number / 100)
+        sender.sent(number, body(number), (lifetime,), number / 100)
+    sender.peers.prove(2, 170)
+    tried, now = 0, 9.0
+    while sender.packets.records[50].alive(now):
+        now += 1
+        sender.peers.report(2, 113, (1 << 63) - 1, settled=True, loss=0.1, now=now)
+        repair = sender.urgent(now)
+        tried += repair is not None and (repair.number, repair.mask) == (50, 1)
+    assert tried == REPAIR_IDS
+    sender.peers.report(2, 113, (1 << 63) - 1, settled=True, loss=0.1, now=now)
+    assert sender.peers.given_up(now) == 50
+
+
 def test_a_peer_that_starts_again_keeps_nothing_back_from_another_one() -> None:
     sender = sent_to({2: 0, 3: 900}, 1000)
     seen = set()
