@@ -97,6 +97,11 @@ class Types:
                 own[name] = found
         return own
 
+    @property
+    def definitions(self) -> dict[str, str]:
+        """Those given that say something else than Humble's."""
+        return {name: self._given[name] for name in self._own}
+
     def _types(self, type_name: str) -> Mapping[str, Any]:
         """The types by which one is read. Definitions given are parsed, which takes milliseconds each, only where its
         name appears in them."""
