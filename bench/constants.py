@@ -60,25 +60,15 @@ RULES: dict[str, dict[str, Any]] = {
     "long messages by value alone": {"long_packets": 1 << 30},
 }
 CONSTANTS = (
-    *("turn_every", "fragment_part", "long_packets"),
-    *("repair_enough", "repair_worth", "repair_patience_s", "repair_poll_s", "repair_calm_poll_s", "repair_most_ahead"),
-    *("gap_packets", "order_smoothing"),
-    *(
-        "hold_overlap",
-        "hold_surplus",
-        "hold_most_owed",
-        "hold_smoothing",
-        "hold_late",
-        "hold_most_in_vain",
-        "hold_gain",
-    ),
-    *("unreported_most_loss", "unreported_enough", "unreported_owed"),
-    *("report_every", "report_per_arrived", "report_per_loss", "report_per_vain", "report_most_saved"),
-    *("report_smoothing", "report_pause_s", "report_calm_s", "report_calm_loss", "report_slower", "report_again_s"),
-    *("report_prompt_loss", "report_oldest"),
-    *("peer_delays", "peer_interval_s", "peer_silence", "peer_later", "peer_soon"),
-    *("hello_bytes_s", "hello_often_s", "hello_seldom_s", "hello_early", "kept_starting_s", "table_share"),
-)
+    "turn_every", "fragment_part", "long_packets", "repair_enough", "repair_worth", "repair_patience_s",
+    "repair_poll_s", "repair_calm_poll_s", "repair_most_ahead", "gap_packets", "order_smoothing", "hold_overlap",
+    "hold_surplus", "hold_most_owed", "hold_smoothing", "hold_late", "hold_most_in_vain", "hold_gain",
+    "unreported_most_loss", "unreported_enough", "unreported_owed", "report_every", "report_per_arrived",
+    "report_per_loss", "report_per_vain", "report_most_saved", "report_smoothing", "report_pause_s", "report_calm_s",
+    "report_calm_loss", "report_slower", "report_again_s", "report_prompt_loss", "report_oldest", "peer_delays",
+    "peer_interval_s", "peer_silence", "peer_later", "peer_soon", "hello_bytes_s", "hello_often_s", "hello_seldom_s",
+    "hello_early", "kept_starting_s", "table_share",
+)  # fmt: skip
 
 
 def scaled(tuning: Tuning, name: str) -> dict[str, Tuning]:

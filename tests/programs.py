@@ -49,7 +49,7 @@ class ProgramProcess(subprocess.Popen[AnyStr]):
     def _execute_child(self, args: Any, executable: Any, preexec_fn: Any, *more: Any) -> None:
         _, _, cwd, env, _, _, shell, *pipes = more[:13]
         ours = not isinstance(args, str) and tuple(map(str, args[:2])) == (sys.executable, "-m")
-        session = more[-2]
+        session = more[18]
         if not ours or shell or preexec_fn is not None or _at_start(env) != _at_start(_ENVIRONMENT):
             super()._execute_child(args, executable, preexec_fn, *more)  # type: ignore[misc]
             return
