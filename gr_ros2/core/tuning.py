@@ -93,7 +93,8 @@ class Tuning:
     """Waits in vain that are counted: at most 4^5 repairs go without waiting before the next one waits. With none,
     odometry in slots is 14 % older with reports, and three times as old one way, at 20 % loss."""
     hold_gain: float = 1 / 16
-    """Part of a packet's airtime that a wait must gain to be worth it."""
+    """Part of a packet's airtime that a wait must gain to be worth it. With 0, odometry one way is 8 % older, and its
+    p99 42 % longer."""
 
     # ---- repairs while nobody reports
 
@@ -174,7 +175,8 @@ class Tuning:
     """By how much the time between two reports grows then. The sender expects reports at their recent interval, so that
     it must not grow faster."""
     report_again_s: float = 0.5
-    """s after which a report is repeated while messages wait for an earlier one."""
+    """s after which a report is repeated while messages wait for an earlier one. Without it, commands before a silence
+    wait 7 % longer at 40 % loss both ways (40 seeds of ``bench.uneven``)."""
     report_prompt_loss: float = 1 / 64
     """Share of packets lost from which on every packet is reported at once, if that takes no slot from anything. The
     sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet. With
