@@ -3,7 +3,7 @@
 A test process has a nursery: one process that has loaded what programs load, and forks one for each start. The program
 has its own arguments, folder, environment and streams, its memory is its own, and the test process is its parent. What
 matters as Python begins (another ``PYTHONPATH`` or home, memory, the time to start) is tried with ``subprocess``, or by
-:data:`ANEW`.
+:data:`ANEW`. What a thread in another network namespace starts begins anew, too.
 """
 
 from __future__ import annotations
@@ -39,6 +39,9 @@ _ALLOCATOR = "jemalloc_bg_thd"
 """Of pyarrow; jemalloc looks after it in forks itself."""
 _ENVIRONMENT = dict(os.environ)
 """Of the nursery."""
+_NETWORK = Path("/proc/thread-self/ns/net")
+"""Names the network namespace of a thread, which may have entered another one."""
+_HERE = _NETWORK.readlink()
 _SUBREAPER = 36
 """``PR_SET_CHILD_SUBREAPER`` of prctl(2)."""
 
@@ -50,7 +53,8 @@ class ProgramProcess(subprocess.Popen[AnyStr]):
         _, _, cwd, env, _, _, shell, *pipes = more[:13]
         ours = not isinstance(args, str) and tuple(map(str, args[:2])) == (sys.executable, "-m")
         session = more[18]
-        if not ours or shell or preexec_fn is not None or _at_start(env) != _at_start(_ENVIRONMENT):
+        elsewhere = _NETWORK.readlink() != _HERE
+        if not ours or elsewhere or shell or preexec_fn is not None or _at_start(env) != _at_start(_ENVIRONMENT):
             super()._execute_child(args, executable, preexec_fn, *more)  # type: ignore[misc]
             return
         stdin, _, _, stdout, _, stderr = pipes

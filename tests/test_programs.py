@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from gr_ros2.core.errors import RunError
+from gr_ros2_lab.race.namespaces import Namespace, check_means, inside
 from tests.programs import ANEW, ProgramProcess, run_program
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
@@ -76,3 +78,15 @@ def test_what_matters_as_python_begins_begins_anew(folder: Path) -> None:
     ):
         done = run_program(command, env=env, **plain)
         assert json.loads(done.stdout)["loaded"] is False
+
+
+def test_a_thread_in_another_network_namespace_starts_its_programs_there(folder: Path) -> None:
+    try:
+        check_means()
+    except RunError as error:
+        pytest.skip(str(error))
+    command = [sys.executable, "-m", "show"]
+    run_program(command, cwd=folder, capture_output=True)  # the nursery is here already
+    with Namespace() as namespace:
+        done = inside(namespace.path, lambda: run_program(command, cwd=folder, capture_output=True, text=True))
+    assert json.loads(done.stdout)["loaded"] is False
