@@ -141,19 +141,6 @@ class BackendTable(Mapping[str, BackendT], Generic[BackendT]):
 
 
 @contextmanager
-def interrupts_ignored() -> Iterator[None]:
-    """Processes and threads that are started inside ignore Ctrl-C. A terminal sends it to a whole process group."""
-    from multiprocessing import resource_tracker  # few commands start processes
-
-    resource_tracker.ensure_running()  # multiprocessing unblocks signals when it starts it, so it must already run
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
 def uninterrupted() -> Iterator[None]:
     """Delay Ctrl-C and SIGTERM until the body of the ``with`` statement is done, for instance an import.
 

@@ -8,15 +8,14 @@ text.
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from multiprocessing.connection import Connection
 from typing import Any
 
-from gr_ros2.core.backends import interrupts_ignored
 from gr_ros2.core.errors import GrRos2Error, RunError
+from gr_ros2.core.forks import FORKS, load_for_forks
 from gr_ros2.core.watch import wait_until
 from gr_ros2_lab.race.namespaces import enter
 
@@ -24,9 +23,8 @@ PROCESSOR_S = "processor_s"
 """What to call for the processor time that all threads of a process have used so far, s."""
 _START_S = 60.0
 _END_S = 10.0
-_FORKS = multiprocessing.get_context("forkserver")
-_FORKS.set_forkserver_preload([f"gr_ros2_lab.race.{part}" for part in ("channel", "endpoints", "links")])
-"""Workers are forked from a process that has loaded what they need, which each would do for a second."""
+_NEEDED = tuple(f"gr_ros2_lab.race.{part}" for part in ("channel", "endpoints", "links"))
+"""Modules that workers are made of."""
 
 
 class Worker:
@@ -42,12 +40,12 @@ class Worker:
         self, name: str, namespace: str, make: Callable[..., AbstractContextManager[Any]], *arguments: Any
     ) -> None:
         self._name = name
-        self._ours, theirs = _FORKS.Pipe()
-        self._process = _FORKS.Process(
+        load_for_forks(*_NEEDED)
+        self._ours, theirs = FORKS.Pipe()
+        self._process = FORKS.Process(
             target=_serve, args=(theirs, namespace, make, arguments), name=f"gr-ros2-{name}", daemon=True
         )
-        with interrupts_ignored():
-            self._process.start()
+        self._process.start()
         theirs.close()
         try:
             self.answer()

@@ -15,7 +15,6 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from itertools import chain
-from multiprocessing import forkserver, get_context
 from statistics import fmean
 from typing import Any, get_args
 
@@ -24,8 +23,8 @@ import numpy as np
 from gr_ros2.codecs.frames import coded_topic
 from gr_ros2.codecs.whole import whole_of
 from gr_ros2.compression import LinkCodec
-from gr_ros2.core.backends import interrupts_ignored
 from gr_ros2.core.errors import ConfigError, RunError
+from gr_ros2.core.forks import FORKS, load_for_forks
 from gr_ros2.core.names import first
 from gr_ros2.link import SentPacket
 from gr_ros2.link.airtime_limit import sustained
@@ -49,7 +48,6 @@ from gr_ros2_lab.run.scenario import Scenario, changed
 from gr_ros2_lab.run.simulate import Simulated, coupled, offered_by, simulate
 from gr_ros2_lab.survey.table import Survey
 
-_FORKS = get_context("forkserver")
 TRIAL_S = 10.0
 """s of traffic on which changes are tried."""
 OVERHEAD_S = 0.0025
@@ -647,7 +645,7 @@ def _on_all_processors(
         yield from map(work, scenarios)
         return
     prepare_processes()
-    pool = ProcessPoolExecutor(processors, _FORKS, _begin_process, (work,))
+    pool = ProcessPoolExecutor(processors, FORKS, _begin_process, (work,))
     try:
         yield from pool.map(_process, scenarios)
     except BrokenProcessPool as error:
@@ -658,9 +656,7 @@ def _on_all_processors(
 
 def prepare_processes() -> None:
     """Begin to load what other processes need, which takes a second, while this one goes on."""
-    with interrupts_ignored():  # the process that waits ends the others
-        _FORKS.set_forkserver_preload([__name__])
-        forkserver.ensure_running()
+    load_for_forks(__name__)
 
 
 def _begin_process(work: Callable[[Scenario], Forecast]) -> None:

@@ -5,7 +5,6 @@ Processes are forked from one that has loaded GNU Radio already, so that many re
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import threading
 import time
@@ -14,6 +13,7 @@ from math import inf
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
+from gr_ros2.core.forks import FORKS, load_for_forks
 from gr_ros2.link.events import Received, ReceiverEvent, Rejected
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.robot_link import RobotLink
@@ -24,8 +24,6 @@ from tests.radio.robots import QOS, config
 PERIODS_S = {1: 0.05, 2: 0.06}
 """s between two messages of a robot, on its link's clock, which in lock step is slower than this machine's. They
 differ, so that robots that begin together do not go on sending together."""
-_FORKS = multiprocessing.get_context("forkserver")
-_FORKS.set_forkserver_preload([__name__, "gr_ros2.phy.psk", "gr_ros2.radio.zmq", "gr_ros2.compression"])
 
 
 class Heard(NamedTuple):
@@ -84,8 +82,9 @@ class RobotProcess:
     def __init__(self, number: int, front_end: dict[str, Any], first: int, **values: Any) -> None:
         self._heard: list[Heard] = []
         self._killed = False
-        self._pipe, theirs = _FORKS.Pipe(duplex=False)
-        self._process = _FORKS.Process(target=_run, args=(number, front_end, first, values, theirs), daemon=True)
+        load_for_forks(__name__, "gr_ros2.phy.psk", "gr_ros2.radio.zmq", "gr_ros2.compression")
+        self._pipe, theirs = FORKS.Pipe(duplex=False)
+        self._process = FORKS.Process(target=_run, args=(number, front_end, first, values, theirs), daemon=True)
         self._process.start()
         theirs.close()
         self._reader = threading.Thread(target=self._read, daemon=True)

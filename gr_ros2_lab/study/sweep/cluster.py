@@ -16,7 +16,6 @@ from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
-from multiprocessing import forkserver, get_context
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,8 @@ from distributed.client import FuturesCancelledError
 from distributed.scheduler import KilledWorker
 
 from gr_ros2 import __version__
-from gr_ros2.core.backends import interrupts_ignored
 from gr_ros2.core.errors import ConfigError, GrRos2Error, RunError
+from gr_ros2.core.forks import FORKS, interrupts_ignored, load_for_forks
 from gr_ros2.settings.files import REGISTRY_DIR, find_registry
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.run.runner import run_scenario
@@ -40,7 +39,6 @@ flowgraphs that do not free theirs at their end, which has happened before."""
 
 _CONNECT_S = 15.0
 _WORKERS_S = 60.0
-_FORKS = get_context("forkserver")
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ def local_cluster(processes: int) -> Iterator[LocalCluster]:
     """
     settings = {
         "distributed.deploy.lost-worker-timeout": "365 days",
-        "distributed.worker.multiprocessing-method": _FORKS.get_start_method(),
+        "distributed.worker.multiprocessing-method": FORKS.get_start_method(),
     }
     with dask.config.set(settings):
         with interrupts_ignored():
@@ -86,8 +84,7 @@ def _load_for_workers() -> None:
         {key: str(value) for key, value in dask.config.get("distributed.nanny.pre-spawn-environ").items()}
     )
     try:
-        _FORKS.set_forkserver_preload([__name__])
-        forkserver.ensure_running()
+        load_for_forks(__name__)
     finally:
         os.environ.clear()
         os.environ.update(before)
